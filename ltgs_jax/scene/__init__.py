@@ -1,0 +1,9 @@
+"""Rank 1: the scene's state as frozen pytrees."""
+
+from .chronology import Chronology as Chronology
+from .chronology import Template as Template
+from .chronology import compose as compose
+from .chronology import drop_hidden as drop_hidden
+from .splats import Splats as Splats
+from .splats import concatenate_splats as concatenate_splats
+from .splats import transform_splats as transform_splats

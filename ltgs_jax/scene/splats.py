@@ -1,0 +1,65 @@
+"""Gaussian splats as a frozen pytree."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.lax import Precision
+from jaxtyping import Array, Bool, Float, Int
+
+from ltgs_jax.geometry import SE3, multiply_quats, rotate_sh
+
+
+class Splats(eqx.Module):
+    """n anisotropic Gaussians, with the parameters stored before activation.
+
+    `means` world frame, scene units; `quats` wxyz, need not be unit; `log_scales` natural log of the standard
+    deviations; `logit_opacities`; `sh` basis-major coefficients, k = (degree+1)².
+    """
+
+    means: Float[Array, "n 3"]
+    quats: Float[Array, "n 4"]
+    log_scales: Float[Array, "n 3"]
+    logit_opacities: Float[Array, " n"]
+    sh: Float[Array, "n k 3"]
+
+    @property
+    def count(self) -> int:
+        """Number of splats."""
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Float[Array, "n 3"]:
+        """Standard deviations in scene units."""
+        return jnp.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Float[Array, " n"]:
+        """Opacities in (0, 1)."""
+        return jax.nn.sigmoid(self.logit_opacities)
+
+    def __getitem__(self, index: Bool[Array, " n"] | Int[Array, " m"] | slice) -> "Splats":
+        """A subset, by mask, indices or slice."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+
+def concatenate_splats(parts: list[Splats]) -> Splats:
+    """Splats one after the other; lower SH degrees are padded with zeros to the highest."""
+    k = max(part.sh.shape[1] for part in parts)
+    padded = [
+        eqx.tree_at(lambda s: s.sh, part, jnp.pad(part.sh, ((0, 0), (0, k - part.sh.shape[1]), (0, 0))))
+        for part in parts
+    ]
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
+
+
+def transform_splats(b_from_a: SE3, splats: Splats) -> Splats:
+    """Move splats rigidly: means, orientations and spherical harmonics (equation 1 of the LTGS paper)."""
+    rotmat = b_from_a.rotmat().astype(splats.means.dtype)
+    means = jnp.einsum("ij,nj->ni", rotmat, splats.means, precision=Precision.HIGHEST) + b_from_a.xyz
+    return Splats(
+        means=means,
+        quats=multiply_quats(b_from_a.quat[None], splats.quats),
+        log_scales=splats.log_scales,
+        logit_opacities=splats.logit_opacities,
+        sh=rotate_sh(splats.sh, rotmat),
+    )
