@@ -130,3 +130,9 @@ def test_no_warning_on_equal_images():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         np.testing.assert_allclose(ssim(image, image), 1, atol=1e-6)
+
+
+def test_a_nan_is_not_hidden():
+    image = jnp.asarray(_pair(10)[0])
+    assert jnp.isnan(ssim(image.at[0, 0, 0].set(jnp.nan), image))
+    assert jnp.isnan(ssim(image.at[20, 20, 1].set(jnp.nan), image))
