@@ -1,0 +1,74 @@
+"""What goes into and comes out of a registration: options, codes, answer."""
+
+import enum
+
+import equinox as eqx
+from jaxtyping import Array, Bool, Float, Int
+
+from ltgs_jax.geometry import SE3
+
+
+class Result(enum.IntEnum):
+    """Codes of `Registration.result`."""
+
+    SUCCESS = 0
+    TOO_FEW_POINTS = 1
+    NO_CONSENSUS = 2
+    NOT_CONVERGED = 3
+
+    @property
+    def reason(self) -> str:
+        """The code in words."""
+        return {
+            Result.SUCCESS: "a rigid motion with a consensus that chance does not explain",
+            Result.TOO_FEW_POINTS: "fewer than 3 usable correspondences: a rigid motion cannot be known",
+            Result.NO_CONSENSUS: "no rigid motion agrees with more correspondences than chance would",
+            Result.NOT_CONVERGED: "the final least squares did not converge",
+        }[self]
+
+
+class RegisterConfig(eqx.Module):
+    """Options of `register`; all static."""
+
+    seeds: int = eqx.field(static=True, default=256)
+    """Most correspondences around which a local consensus set is grown."""
+    finalists: int = eqx.field(static=True, default=16)
+    """Hypotheses that are refined on all correspondences before one is chosen."""
+    anneal: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 1.0))
+    """Bounds of the Geman-McClure annealing of each hypothesis, in units of the noise bound."""
+    refine_steps: int = eqx.field(static=True, default=8)
+    """Reweighted closed-form steps of each finalist."""
+    max_steps: int = eqx.field(static=True, default=64)
+    """Levenberg-Marquardt steps of the final solve."""
+    min_confidence: float = eqx.field(static=True, default=0.5)
+    """Confidence under which the answer is called NO_CONSENSUS."""
+    ambiguous_ratio: float = eqx.field(static=True, default=0.02)
+    """Least ratio of the two smallest moments of inertia of the inliers at which a rotation counts as fixed."""
+
+
+class Registration(eqx.Module):
+    """The answer of `register`.
+
+    `dst_from_src` SE(3), the best motion found even when `result` names a failure (the identity without 3 usable
+    points); `inlier_weights` [n] in [0, 1]; `inliers` how many residuals lie under the noise bound; `residual` their
+    root mean square, in the unit of the points; `covariance` [6 6] of the tangent (v, ω) at `dst_from_src`, right
+    perturbation; `result` a code of `Result`; `confidence` in [0, 1]; `ambiguous_axis` a unit vector in the frame of
+    `src` about which the rotation is not fixed, zero where there is none; `second` the next motion that other
+    correspondences agree on, with their count `second_inliers` (0 where chance explains it).
+    """
+
+    dst_from_src: SE3
+    inlier_weights: Float[Array, " n"]
+    inliers: Int[Array, ""]
+    residual: Float[Array, ""]
+    covariance: Float[Array, "6 6"]
+    result: Int[Array, ""]
+    confidence: Float[Array, ""]
+    ambiguous_axis: Float[Array, "3"]
+    second: SE3
+    second_inliers: Int[Array, ""]
+
+    @property
+    def ambiguous(self) -> Bool[Array, ""]:
+        """Whether the rotation about `ambiguous_axis` is free."""
+        return (self.ambiguous_axis != 0).any(-1)

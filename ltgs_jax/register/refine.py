@@ -1,0 +1,100 @@
+"""Final robust least squares on the tangent of SE(3), with optimistix, and what it says about the answer."""
+
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jax.lax import Precision
+from jaxtyping import Array, Bool, Float
+
+from ltgs_jax.geometry import SE3
+
+from .hypotheses import Problem
+from .outcome import RegisterConfig
+
+# 99 % of the residuals of three Gaussian coordinates lie under 3.37 σ: √(χ²₃ at 0.99).
+BOUND_IN_SIGMA = 3.3682
+
+
+def robust_residuals(whitened: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
+    """Residuals whose squares sum to −2·log likelihood of an inlier Gaussian with a constant share of outliers.
+
+    `whitened` in units of σ. The share is such that a residual at the noise bound is an inlier with odds of one: a
+    smooth truncated least squares, ρ = −2·log((exp(−m²/2) + c)/(1 + c)).
+    """
+    squared = jnp.sum(whitened * whitened, axis=-1)
+    outlier = jnp.exp(jnp.asarray(-0.5 * BOUND_IN_SIGMA**2, squared.dtype))
+    positive = squared > 0
+    safe = jnp.where(positive, squared, 1)
+    rho = -2 * jnp.log1p(jnp.expm1(-0.5 * safe) / (1 + outlier))
+    factor = jnp.where(positive, jnp.sqrt(rho / safe), jax.lax.rsqrt(1 + outlier))
+    return factor[:, None] * whitened
+
+
+def inlier_probability(whitened: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Weight of each residual in the robust fit: its odds against the constant share of outliers."""
+    squared = jnp.sum(whitened * whitened, axis=-1)
+    return jax.nn.sigmoid(0.5 * (BOUND_IN_SIGMA**2 - squared))
+
+
+def _whitened(motion: SE3, src, dst, whitener) -> Float[Array, "n 3"]:
+    residuals = motion.apply(src) - dst
+    return jnp.einsum("nij,nj->ni", whitener, residuals, precision=Precision.HIGHEST)
+
+
+def final_solve(
+    start: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], config: RegisterConfig
+) -> tuple[SE3, Bool[Array, ""]]:
+    """The robust optimum near `start`, and whether the solver got there.
+
+    Differentiable in the points and the whitener by the implicit function theorem at the optimum; the start carries
+    no gradient.
+    """
+    start = jax.lax.stop_gradient(start)
+    eps = float(jnp.finfo(start.xyz.dtype).eps)
+    solver = optx.LevenbergMarquardt(rtol=eps**0.75, atol=eps**0.75)
+
+    def residuals(tangent, args):
+        src, dst, weights, whitener = args
+        whitened = _whitened(start @ SE3.exp(tangent), src, dst, whitener)
+        return jnp.sqrt(weights)[:, None] * robust_residuals(whitened)
+
+    solution = optx.least_squares(
+        residuals,
+        solver,
+        jnp.zeros(6, start.xyz.dtype),
+        args=(problem.src, problem.dst, problem.weights, whitener),
+        max_steps=config.max_steps,
+        throw=False,
+        adjoint=optx.ImplicitAdjoint(linear_solver=lx.AutoLinearSolver(well_posed=False)),
+    )
+    motion = start @ SE3.exp(solution.value)
+    finite = jnp.isfinite(motion.quat).all() & jnp.isfinite(motion.xyz).all()
+    motion = jax.tree.map(lambda new, old: jnp.where(finite, new, old), motion, start)
+    return motion, finite & (solution.result == optx.RESULTS.successful)
+
+
+def information(
+    motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], weights: Float[Array, " n"]
+) -> Float[Array, "6 6"]:
+    """JᵀWJ of the whitened residuals at the motion, for the tangent (v, ω)."""
+    rotmat = motion.rotmat()
+    x, y, z = problem.src.T
+    zero = jnp.zeros_like(x)
+    minus_skew = jnp.stack(
+        [jnp.stack([zero, z, -y], -1), jnp.stack([-z, zero, x], -1), jnp.stack([y, -x, zero], -1)], axis=-2
+    )
+    local = jnp.concatenate([jnp.broadcast_to(jnp.eye(3, dtype=x.dtype), minus_skew.shape), minus_skew], axis=-1)
+    jacobian = jnp.einsum("nij,jk,nkl->nil", whitener, rotmat, local, precision=Precision.HIGHEST)
+    return jnp.einsum("n,nij,nik->jk", weights, jacobian, jacobian, precision=Precision.HIGHEST)
+
+
+def free_axis(information_matrix: Float[Array, "6 6"], config: RegisterConfig) -> Float[Array, "3"]:
+    """Unit axis, in the frame of `src`, about which the inliers do not fix the rotation; zero where they do."""
+    a, b, c = information_matrix[:3, :3], information_matrix[:3, 3:], information_matrix[3:, 3:]
+    scale = jnp.trace(a)
+    a = a + jnp.finfo(a.dtype).eps * jnp.maximum(scale, jnp.finfo(a.dtype).tiny) * jnp.eye(3, dtype=a.dtype)
+    rotation = c - jnp.matmul(b.T, jnp.linalg.solve(a, b), precision=Precision.HIGHEST)
+    values, vectors = jnp.linalg.eigh(0.5 * (rotation + rotation.T))
+    free = (values[0] < config.ambiguous_ratio * values[1]) & (values[1] > 0)
+    return jnp.where(free, vectors[:, 0], 0)
