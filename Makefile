@@ -1,0 +1,42 @@
+# Two commands on a bare machine with Python 3.11 or newer: `make demo` and `make test`.
+# PYTHON=… chooses the interpreter, EXTRAS=dev,demo,view,onnx,experiments,cuda13 what is installed, OUT=… the demo's folder.
+
+VENV := .venv
+EXTRAS ?= dev,demo,view,onnx,experiments
+OUT ?= demo_out
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
+
+.PHONY: demo test slow check format install lock clean
+
+demo: $(STAMP)
+	$(BIN)/ltgs demo --out $(OUT)
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+check: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml requirements.lock .ci/make-venv
+	.ci/make-venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[$(EXTRAS)]'
+	touch $@
+
+lock: $(STAMP)
+	.ci/write-lock $(BIN)/python $(EXTRAS)
+
+clean:
+	rm -rf $(VENV) .jax_cache .pytest_cache .ruff_cache $(OUT)
