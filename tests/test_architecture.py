@@ -19,7 +19,7 @@ RANKS = {
     "io": 2,
     "render": 2,
     "features": 2,
-    "demo": 2,
+    "demo": 3,  # writes its captures through io
     "localize": 3,
     "detect": 3,
     "match": 3,

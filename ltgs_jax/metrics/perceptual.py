@@ -65,4 +65,5 @@ def lpips(image: Float[np.ndarray, "h w 3"], target: Float[np.ndarray, "h w 3"],
     if len(names) != 2:
         raise ValueError(f"{weights}: expected a network of two images, got {len(names)} inputs")
     batches = [np.moveaxis(np.asarray(pixels, np.float32) * 2 - 1, -1, 0)[None] for pixels in (image, target)]
-    return float(np.mean(session.run(None, dict(zip(names, batches, strict=True)))[0]))
+    distance = session.run(None, dict(zip(names, batches, strict=True)))[0]
+    return float(np.mean(np.asarray(distance)))

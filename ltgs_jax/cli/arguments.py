@@ -1,0 +1,175 @@
+"""The options of each command, as frozen dataclasses that tyro parses, with errors on one line."""
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Generic, Literal, TypeVar
+
+import tyro
+from tyro.conf import Positional
+
+C = TypeVar("C")
+Parsed = TypeVar("Parsed")
+
+
+class UsageError(ValueError):
+    """A command or an option is wrong; the message is one line that names it."""
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a small capture with known truth, run everything on it, print the scores; open nothing."""
+
+    out: Path = Path("demo_out")
+    """Folder of the chronology; the capture is made in its sub-folder `capture`."""
+    scene: Literal["move", "turnover", "clutter", "nochange", "light"] = "turnover"
+    """Which story the capture tells."""
+    preset: Literal["fast", "paper", "tiny"] = "fast"
+    """Options of the pipeline."""
+    seed: int = 0
+    """Chooses room, objects and events."""
+
+
+@dataclass(frozen=True)
+class Update(Generic[C]):
+    """Find what changed in a capture, and give the scene at every visit. Run again, it resumes."""
+
+    capture: Positional[Path]
+    """Folder of photographs, one sub-folder per visit, and a COLMAP model."""
+    out: Path
+    """Folder of the chronology; made when it is missing."""
+    config: Annotated[C, tyro.conf.arg(name="")]
+    preset: Literal["fast", "paper", "tiny"] = "fast"
+    """Where the options below start from."""
+    initial: Path | None = None
+    """A trained splat scene of the first visit (Inria layout), instead of fitting one."""
+    seed: int = 0
+    """Of everything that is drawn at random."""
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Score a chronology again from what is on disk, and write its report anew."""
+
+    folder: Positional[Path]
+    """Folder of the chronology."""
+    capture: Path | None = None
+    """The capture, if it has moved since."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Write images of a visit."""
+
+    folder: Positional[Path]
+    """Folder of the chronology."""
+    visit: str
+    """Name of a visit, or its number from 0."""
+    out: Path
+    """Folder of the images."""
+    camera: str | None = None
+    """Name of a photograph, as `<visit>/<name>.jpg`: its camera alone."""
+    all_test: bool = False
+    """The cameras of all test photographs of every visit."""
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write the splats of a visit to one file."""
+
+    folder: Positional[Path]
+    """Folder of the chronology."""
+    visit: str
+    """Name of a visit, or its number from 0."""
+    out: Path
+    """The file."""
+    format: str = "ply"
+    """Layout of the file."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a chronology in the browser, with a slider over visits."""
+
+    folder: Positional[Path]
+    """Folder of the chronology."""
+    port: int = 8080
+    """Of the local web server; the next free one is taken when it is in use."""
+    host: str = "localhost"
+    """Address to listen at; 0.0.0.0 lets other machines in."""
+
+
+COMMANDS: dict[str, type] = {
+    "demo": Demo,
+    "update": Update,
+    "eval": Eval,
+    "render": Render,
+    "export": Export,
+    "view": View,
+}
+
+
+def parse(argv: Sequence[str]) -> Any:
+    """The record of the command that `argv` names.
+
+    Raises UsageError; asked for help, prints it and raises SystemExit(0).
+    """
+    if not argv or argv[0] in ("-h", "--help"):
+        print(_overview())
+        raise SystemExit(0 if argv else 2)
+    name, *rest = argv
+    if name == "--version":
+        from ltgs_jax import __version__
+
+        print(__version__)
+        raise SystemExit(0)
+    if name not in COMMANDS:
+        raise UsageError(f"unknown command {name!r}; there are {', '.join(COMMANDS)}")
+    if name == "update":
+        return _parse_update(rest)
+    return _parse(COMMANDS[name], rest, prog=f"ltgs {name}")
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS)) + 2
+    rows = [f"  {name:<{width}}{(record.__doc__ or '').strip()}" for name, record in COMMANDS.items()]
+    return "\n".join(["usage: ltgs COMMAND …", "", *rows, "", "`ltgs COMMAND --help` lists the options of a command."])
+
+
+def _parse_update(rest: Sequence[str]) -> Update:
+    """Two passes: the preset says where the other options start from."""
+    from ltgs_jax.pipeline import PRESETS, Config
+
+    preset = "fast"
+    for i, word in enumerate(rest):
+        if word.startswith("--preset"):
+            preset = word.partition("=")[2] or "".join(rest[i + 1 : i + 2])
+    start = PRESETS.get(preset, PRESETS["fast"])  # an unknown name is refused below, with the list of names
+    default = Update(capture=tyro.MISSING, out=tyro.MISSING, config=start)
+    return _parse(Update[Config], rest, prog="ltgs update", default=default)
+
+
+def _parse(record: type[Parsed], args: Sequence[str], *, prog: str, **options) -> Parsed:
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(record, args=list(args), prog=prog, **options)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise UsageError(_one_line(said.getvalue())) from None
+
+
+def _one_line(box: str) -> str:
+    """The message in tyro's box, up to the rule that comes before its hints."""
+    words: list[str] = []
+    for line in box.splitlines():
+        inside = re.sub(r"^\W*[│╭╰]|[│╮╯]\W*$", "", line).strip()
+        if re.fullmatch(r"─{3,}", inside) and words:
+            break
+        if inside and "─" not in inside:
+            words.append(inside)
+    return " ".join(words) or "the options cannot be read"
