@@ -1,0 +1,165 @@
+"""Which splats reach which tiles, front to back."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, UInt
+
+from .project import Projected
+
+
+class Grid(eqx.Module):
+    """The tiles of one image, or of a batch of `cameras` equal ones, row by row; all fields static."""
+
+    width: int = eqx.field(static=True)
+    height: int = eqx.field(static=True)
+    tile_size: int = eqx.field(static=True)
+    cameras: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // self.tile_size)
+
+    @property
+    def rows(self) -> int:
+        """Tiles in a column."""
+        return -(-self.height // self.tile_size)
+
+    @property
+    def per_camera(self) -> int:
+        """Tiles of one camera."""
+        return self.columns * self.rows
+
+    @property
+    def count(self) -> int:
+        """Tiles of all cameras."""
+        return self.per_camera * self.cameras
+
+    def origins(self) -> Int[Array, "tiles 2"]:
+        """Pixel index (x, y) of the first pixel of every tile of one camera."""
+        tile = jnp.arange(self.per_camera, dtype=jnp.int32)
+        return jnp.stack([tile % self.columns, tile // self.columns], axis=-1) * self.tile_size
+
+
+class Bins(eqx.Module):
+    """Splats of every tile: those of tile t are `splats[starts[t] : starts[t] + counts[t]]`, front to back.
+
+    `overflow` counts the pairs that did not fit.
+    """
+
+    splats: Int[Array, " i"]
+    starts: Int[Array, " tiles"]
+    counts: Int[Array, " tiles"]
+    overflow: Int[Array, ""]
+
+
+def depth_order(projected: Projected) -> Int[Array, " m"]:
+    """Indices by increasing depth, equal depths by index, culled splats last.
+
+    One key-only sort of packed (depth bits, index) for float32, two stable ones, low bits first, for float64: sorting
+    keys alone is 5–7 times faster on CPUs than carrying a payload (fact 9 of the conventions).
+    """
+    depths = jax.lax.stop_gradient(projected.depths)
+    with jax.enable_x64(True):
+        count = depths.shape[0]
+        index = jnp.arange(count, dtype=jnp.uint64)
+        # Positive floats order as their bits do.
+        if depths.dtype == jnp.float32:
+            words = [jax.lax.bitcast_convert_type(depths, jnp.uint32)]
+        else:
+            bits = jax.lax.bitcast_convert_type(depths, jnp.uint64)
+            words = [(bits & jnp.uint64(0xFFFFFFFF)).astype(jnp.uint32), (bits >> jnp.uint64(32)).astype(jnp.uint32)]
+        words[-1] = jnp.where(projected.visible, words[-1], jnp.uint32(0xFFFFFFFF))
+        order = None
+        for word in words:
+            word = word if order is None else word[order]
+            position = _low_word(jnp.sort((word.astype(jnp.uint64) << jnp.uint64(32)) | index))
+            order = position if order is None else order[position]
+    return order
+
+
+def _low_word(packed: UInt[Array, " m"]) -> Int[Array, " m"]:
+    """The lower 32 bits as int32."""
+    return (packed & jnp.uint64(0xFFFFFFFF)).astype(jnp.uint32).astype(jnp.int32)
+
+
+def tile_boxes(projected: Projected, grid: Grid) -> Int[Array, "m 4"]:
+    """First and one-past-last tile column and row that the box of every splat touches; empty where culled."""
+    # The margin covers rounding in the extents; the decision at α = 1/255 falls at the pixel.
+    half = projected.extents * 1.0001 + 0.001
+    size = jnp.asarray([grid.width, grid.height], half.dtype)
+    centre = jax.lax.stop_gradient(projected.means2d)
+    first = jnp.clip(jnp.ceil(centre - half - 0.5), 0, size).astype(jnp.int32)
+    last = jnp.clip(jnp.floor(centre + half - 0.5), -1, size - 1).astype(jnp.int32)
+    low = first // grid.tile_size
+    high = last // grid.tile_size + 1
+    empty = ~projected.visible[:, None] | (last < first)
+    return jnp.concatenate([jnp.where(empty, 0, low), jnp.where(empty, 0, high)], axis=-1)
+
+
+def _reaches(
+    projected: Projected, splat: Int[Array, " i"], corner: Float[Array, "i 2"], grid: Grid
+) -> Int[Array, " i"]:
+    """Whether the ellipse α ≥ 1/255 of a splat meets the pixel centres' rectangle of a tile.
+
+    The exponent is convex: outside of the rectangle its minimum lies on one of the two edges that face the centre.
+    """
+    columns = [projected.inverse_a, projected.slope, projected.inverse_b, projected.reach]
+    table = jax.lax.stop_gradient(jnp.concatenate([projected.means2d, jnp.stack(columns, axis=-1)], axis=-1))[splat]
+    mean_x, mean_y, inverse_a, slope, inverse_b, reach = (table[:, j] for j in range(6))
+    x0, y0 = corner[:, 0] + 0.5 - mean_x, corner[:, 1] + 0.5 - mean_y
+    x1, y1 = x0 + (grid.tile_size - 1), y0 + (grid.tile_size - 1)
+    near_x, near_y = jnp.clip(0, x0, x1), jnp.clip(0, y0, y1)
+
+    def exponent(dx, dy):
+        return 0.5 * ((dx * inverse_a) ** 2 + ((dy - slope * dx) * inverse_b) ** 2)
+
+    on_vertical = exponent(near_x, jnp.clip(slope * near_x, y0, y1))
+    # Along the row dy = near_y the exponent's minimum in dx.
+    weight = (slope * inverse_b) ** 2
+    along = slope * inverse_b**2 / (inverse_a**2 + weight) * near_y
+    on_horizontal = exponent(jnp.clip(along, x0, x1), near_y)
+    return jnp.minimum(on_vertical, on_horizontal) <= reach * 1.0001 + 0.001
+
+
+def bin_splats(projected: Projected, grid: Grid, capacity: int, active: Int[Array, " tiles"] | None = None) -> Bins:
+    """Bin m = cameras·n splats, camera by camera, into the tiles that they reach.
+
+    `active` (optional) is nonzero for the tiles that are wanted; others stay empty. Not differentiable.
+    """
+    m = projected.depths.shape[0]
+    if m == 0:
+        empty = jnp.zeros(grid.count, jnp.int32)
+        return Bins(jnp.zeros(1, jnp.int32), empty, empty, jnp.zeros((), jnp.int32))
+    order = depth_order(projected)
+    boxes = tile_boxes(projected, grid)[order]
+    wide, high = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
+    with jax.enable_x64(True):
+        counts = (wide * high).astype(jnp.int64)
+        ends = jnp.cumsum(counts)
+        total = ends[-1]
+        begins = jnp.minimum(ends - counts, capacity).astype(jnp.int32)
+        overflow = jnp.clip(total - capacity, 0, 2**31 - 1).astype(jnp.int32)
+        total = jnp.minimum(total, capacity).astype(jnp.int32)
+    # Slot i belongs to the last splat that begins at or before it: count the beginnings.
+    marks = jnp.zeros(capacity + 1, jnp.int32).at[begins].add(1)
+    rank = jnp.cumsum(marks[:capacity]) - 1
+    slot = jnp.arange(capacity, dtype=jnp.int32)
+    facts = jnp.concatenate([boxes[:, :2], wide[:, None], begins[:, None], order[:, None]], axis=-1)[rank]
+    local = slot - facts[:, 3]
+    width = jnp.maximum(facts[:, 2], 1)
+    column, row = facts[:, 0] + local % width, facts[:, 1] + local // width
+    corner = jnp.stack([column, row], axis=-1).astype(projected.means2d.dtype) * grid.tile_size
+    splat = facts[:, 4]
+    tile = splat // (m // grid.cameras) * grid.per_camera + row * grid.columns + column
+    wanted = (slot < total) & _reaches(projected, splat, corner, grid)
+    if active is not None:
+        wanted &= active[jnp.clip(tile, 0, grid.count - 1)] != 0
+    tile = jnp.where(wanted, tile, grid.count)
+    with jax.enable_x64(True):
+        word = jnp.uint32 if (grid.count + 1) * m < 2**32 else jnp.uint64
+        keys = jnp.sort(tile.astype(word) * word(m) + rank.astype(word))
+        edges = jnp.searchsorted(keys, jnp.arange(grid.count + 1, dtype=word) * word(m)).astype(jnp.int32)
+        splats = order[(keys % word(m)).astype(jnp.int32)]
+    return Bins(splats, edges[:-1], edges[1:] - edges[:-1], overflow)

@@ -1,0 +1,128 @@
+"""Splats to image: means, conics in LDL form, extents, colours."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ltgs_jax.geometry import Camera, eval_sh, rotmat_from_quat
+from ltgs_jax.scene import Splats
+
+from .config import ALPHA_MIN, EPS2D
+
+# Larger inputs are culled: their squares would leave float32's range. Far beyond any scene in any unit.
+_LARGEST = 1e15
+
+
+class Projected(eqx.Module):
+    """n splats as one camera sees them.
+
+    `means2d` pixels; the exponent at offset (dx, dy) is ½[(dx·inverse_a)² + ((dy − slope·dx)·inverse_b)²], the LDL form
+    of fact 1 in the conventions; `extents` half sizes in pixels of the box outside of which α < 1/255; `reach` the
+    exponent at which α = 1/255; `visible` false for culled splats, whose other fields are finite and meaningless.
+    """
+
+    means2d: Float[Array, "n 2"]
+    inverse_a: Float[Array, " n"]
+    slope: Float[Array, " n"]
+    inverse_b: Float[Array, " n"]
+    opacities: Float[Array, " n"]
+    depths: Float[Array, " n"]
+    colors: Float[Array, "n ch"]
+    extents: Float[Array, "n 2"]
+    reach: Float[Array, " n"]
+    visible: Bool[Array, " n"]
+
+
+def _bounded(x: Float[Array, "n ..."], largest: float = _LARGEST) -> Bool[Array, " n"]:
+    """Whether all entries of each row are numbers of usable size (false for NaN)."""
+    return jnp.all(jnp.abs(x).reshape(x.shape[0], -1) <= largest, axis=-1)
+
+
+def _choose(mask: Bool[Array, " n"], x: Float[Array, "n ..."], other: float) -> Float[Array, "n ..."]:
+    """Rows of `x` where the mask holds, a constant elsewhere: the inner half of a double where."""
+    return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(other, x.dtype))
+
+
+def _times(matrix, vectors: list) -> list:
+    """Elementwise 3×3 by list of three arrays: exact products on every device, and no tiny batched matmul."""
+    return [matrix[i][0] * vectors[0] + matrix[i][1] * vectors[1] + matrix[i][2] * vectors[2] for i in range(3)]
+
+
+def project_splats(
+    splats: Splats, camera: Camera, *, near: float, colors: Float[Array, "n ch"] | None = None
+) -> Projected:
+    """Project splats into one camera (EWA splatting with the affine approximation of Zwicker et al. 2001, as 3DGS).
+
+    Culled, with zero gradients: splats nearer than `near`, below 1/255 opacity, or with an entry that is NaN, infinite
+    or beyond 1e15. Not differentiable where the direction to a mean leaves 1.3 times the field of view, since the
+    Jacobian is frozen there as in 3DGS.
+    """
+    dtype = splats.means.dtype
+    values = splats.sh if colors is None else colors
+    camera_usable = _bounded(jnp.concatenate([x.ravel() for x in jax.tree.leaves(camera)])[None])[0]
+    usable = camera_usable & _bounded(splats.means) & _bounded(splats.quats, float(jnp.finfo(dtype).max))
+    # A logarithm of −∞ is a scale of 0, a logit of ±∞ an opacity of 0 or 1: all three are meant so.
+    usable &= jnp.all(splats.log_scales <= 34, axis=-1) & (splats.logit_opacities >= -jnp.inf) & _bounded(values)
+
+    camera = jax.tree.map(lambda x: jnp.where(camera_usable, x, jnp.ones_like(x)).astype(dtype), camera)
+    means, quats = _choose(usable, splats.means, 0), _choose(usable, splats.quats, 1)
+    scales = jnp.exp(_choose(usable, splats.log_scales, 0))
+    opacities = jax.nn.sigmoid(_choose(usable, splats.logit_opacities, 0))
+    values = _choose(usable, values, 0)
+
+    rotmat = camera.cam_from_world.rotmat()
+    local = [x + camera.cam_from_world.xyz[i] for i, x in enumerate(_times(rotmat, [means[:, i] for i in range(3)]))]
+    in_front = usable & (local[2] >= near) & _bounded(jnp.stack(local, axis=-1))
+    x, y, z = (jnp.where(in_front, v, fill) for v, fill in zip(local, (0, 0, 1), strict=True))
+
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    means2d = jnp.stack([fx * (x / z) + cx, fy * (y / z) + cy], axis=-1)
+
+    # 3DGS freezes the affine approximation outside of 1.3 times the field of view.
+    margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
+    tan_x = jnp.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
+    tan_y = jnp.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
+    axes = rotmat_from_quat(quats)
+    # M = J·W·R·S, row by row (2×3); its minors give the determinant without cancellation.
+    turned = [_times(rotmat, [axes[:, i, j] * scales[:, j] for i in range(3)]) for j in range(3)]
+    row_x = [fx / z * (turned[j][0] - tan_x * turned[j][2]) for j in range(3)]
+    row_y = [fy / z * (turned[j][1] - tan_y * turned[j][2]) for j in range(3)]
+    fits = jnp.abs(jnp.stack(row_x + row_y)).max(axis=0) <= _LARGEST
+    visible = in_front & fits
+    row_x, row_y = ([jnp.where(visible, v, 0) for v in row] for row in (row_x, row_y))
+    xx, yy = sum(v * v for v in row_x), sum(v * v for v in row_y)
+    a, c = xx + EPS2D, yy + EPS2D
+    slope = sum(u * v for u, v in zip(row_x, row_y, strict=True)) / a
+    inverse_a = jax.lax.rsqrt(a)
+    unit = [v * inverse_a for v in row_x]
+    minors = [
+        unit[1] * row_y[2] - unit[2] * row_y[1],
+        unit[2] * row_y[0] - unit[0] * row_y[2],
+        unit[0] * row_y[1] - unit[1] * row_y[0],
+    ]
+    det_over_a = sum(v * v for v in minors) + EPS2D * (1 + yy / a)
+    inverse_b = jax.lax.rsqrt(det_over_a)
+
+    if colors is None:
+        direction = means - camera.center()
+        squared = jnp.sum(direction * direction, axis=-1, keepdims=True)
+        safe = in_front[:, None] & (squared > 0)
+        direction = jnp.where(safe, direction, 1) * jax.lax.rsqrt(jnp.where(safe, squared, 3))
+        values = eval_sh(values, direction)
+
+    reach = jnp.log(jnp.maximum(opacities, ALPHA_MIN) / ALPHA_MIN)
+    visible &= opacities >= ALPHA_MIN
+    extents = jnp.sqrt(2 * reach)[:, None] * jnp.sqrt(jnp.stack([a, c], axis=-1))
+    return Projected(
+        means2d=means2d,
+        inverse_a=inverse_a,
+        slope=slope,
+        inverse_b=inverse_b,
+        opacities=opacities,
+        depths=z,
+        colors=values,
+        extents=jax.lax.stop_gradient(extents),
+        reach=jax.lax.stop_gradient(reach),
+        visible=visible,
+    )
