@@ -367,7 +367,8 @@ def test_real_captures(shared):
     seen = capture.point_observations
     for index in np.unique(seen.photographs)[::9]:
         mine = seen.photographs == index
-        pixels, _ = capture.photographs[index].camera.project(capture.points[seen.points[mine]].astype(np.float32))
+        camera = capture.photographs[index].camera
+        pixels = np.asarray(camera.project(capture.points.astype(np.float32))[0])[seen.points[mine]]
         # The observations are in the distorted photograph, 0.005 of distortion is a pixel or two at its corners.
         assert np.median(np.linalg.norm(pixels - seen.pixels[mine], axis=1)) < 2
     assert io.load_mask(capture.photographs[0]).mean() == pytest.approx(0.93, abs=0.01)
