@@ -7,12 +7,15 @@ from .capture import distort_labels as distort_labels
 from .capture import load_image as load_image
 from .capture import load_mask as load_mask
 from .capture import read_capture as read_capture
+from .chronology import load_chronology as load_chronology
+from .chronology import save_chronology as save_chronology
 from .colmap import ColmapImage as ColmapImage
 from .colmap import ColmapModel as ColmapModel
 from .colmap import find_colmap as find_colmap
 from .colmap import read_colmap as read_colmap
 from .colmap_text import write_colmap as write_colmap
 from .files import InputError as InputError
+from .files import read_bytes as read_bytes
 from .files import read_json as read_json
 from .files import replacing as replacing
 from .files import write_bytes as write_bytes
@@ -24,3 +27,6 @@ from .images import write_labels as write_labels
 from .lens import CameraModel as CameraModel
 from .ply import read_ply as read_ply
 from .ply import write_ply as write_ply
+from .tracks import read_tracks as read_tracks
+from .tracks import tracks_schema as tracks_schema
+from .tracks import write_tracks as write_tracks

@@ -53,20 +53,20 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 def write_json(path: str | Path, value: Any) -> None:
     """Write JSON in one step; NaN and infinities, which JSON does not have, become null. Raises InputError."""
-    text = json.dumps(_finite(value), indent=1, allow_nan=False)
+    text = json.dumps(plain_json(value), indent=1, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
 
 
-def _finite(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
     """The value with non-finite floats as None, NumPy and JAX scalars and arrays as Python's, paths as text."""
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
+        return {str(key): plain_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [plain_json(item) for item in value]
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):
-        return _finite(value.tolist())
+        return plain_json(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

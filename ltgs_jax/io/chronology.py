@@ -1,0 +1,151 @@
+"""Chronologies on disk: chronology.safetensors holds everything, chronology.json says in words what is in it."""
+
+import json
+import math
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import safetensors.numpy
+
+from ltgs_jax.geometry import SE3
+from ltgs_jax.scene import Chronology, Splats, Template
+
+from .files import InputError, read_bytes, safe_name, write_bytes, write_json
+
+_VERSION = 1
+_SPLAT_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+_DTYPES = ("float32", "float64")
+
+
+def save_chronology(folder: str | Path, chronology: Chronology) -> None:
+    """Write `chronology.safetensors` and its description `chronology.json`, each in one step.
+
+    The arrays file carries the description too, so that whichever moment a run is stopped at, it is whole by itself.
+    Raises InputError when the folder cannot be written.
+    """
+    folder = Path(folder)
+    arrays = {
+        "world_from_template.quat": chronology.world_from_template.quat,
+        "world_from_template.xyz": chronology.world_from_template.xyz,
+        "visible": chronology.visible,
+        "exposure": chronology.exposure,
+    }
+    parts = {"background": chronology.background}
+    parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
+    for name, splats in parts.items():
+        arrays |= {f"{name}.{field}": getattr(splats, field) for field in _SPLAT_FIELDS}
+    description = {
+        "version": _VERSION,
+        "visits": list(chronology.visits),
+        "photographs": list(chronology.photographs),
+        "templates": [
+            {"identity": t.identity, "source_visit": t.source_visit, "splats": t.splats.count}
+            for t in chronology.templates
+        ],
+        "background_splats": chronology.background.count,
+    }
+    content = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    metadata = {"chronology": json.dumps(description)}
+    write_bytes(folder / "chronology.safetensors", safetensors.numpy.save(content, metadata))
+    write_json(folder / "chronology.json", description)
+
+
+def load_chronology(folder: str | Path) -> Chronology:
+    """The chronology that `save_chronology` wrote, bit for bit, in the dtypes that it had.
+
+    Raises InputError that names the file when it is missing, cut short, or does not fit together.
+    """
+    path = Path(folder) / "chronology.safetensors"
+    content = read_bytes(path)
+    description, arrays = _describe(content, path), _parse_arrays(content, path)
+    visits = tuple(safe_name(name, source=path) for name in description["visits"])
+    photographs = tuple(safe_name(name, source=path) for name in description["photographs"])
+    rows = description["templates"]
+    t, k, p = len(visits), len(rows), len(photographs)
+    take = _Taker(arrays, path)
+    templates = tuple(
+        Template(take.splats(f"templates.{i}", row["splats"]), row["identity"], row["source_visit"])
+        for i, row in enumerate(rows)
+    )
+    return Chronology(
+        background=take.splats("background", description["background_splats"]),
+        templates=templates,
+        world_from_template=SE3(
+            take("world_from_template.quat", (t, k, 4)),
+            take("world_from_template.xyz", (t, k, 3)),
+        ),
+        visible=take("visible", (t, k), dtypes=("bool",)),
+        exposure=take("exposure", (p, 3, 2)),
+        visits=visits,
+        photographs=photographs,
+    )
+
+
+def _header(content: bytes, path: Path) -> dict:
+    """The JSON header of a safetensors file, its length believed only as far as the file reaches."""
+    length = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or length > len(content) - 8:
+        raise InputError(f"{path}: is cut short or not a safetensors file")
+    try:
+        header = json.loads(content[8 : 8 + length])
+    except (ValueError, RecursionError):
+        header = None
+    if not isinstance(header, dict):
+        raise InputError(f"{path}: its header is not JSON")
+    return header
+
+
+def _describe(content: bytes, path: Path) -> dict:
+    """The description inside the arrays file, with the types that `load_chronology` goes by."""
+    header = _header(content, path)
+    try:
+        description = json.loads(header["__metadata__"]["chronology"])
+        version = description["version"]
+        sound = (
+            all(isinstance(name, str) for name in (*description["visits"], *description["photographs"]))
+            and type(description["background_splats"]) is int
+            and all(
+                type(row[key]) is int
+                for row in description["templates"]
+                for key in ("identity", "source_visit", "splats")
+            )
+        )
+    except (KeyError, TypeError, ValueError, RecursionError):
+        raise InputError(f"{path}: does not describe a chronology") from None
+    if version != _VERSION:
+        raise InputError(f"{path}: is of version {version}; this program reads version {_VERSION}")
+    if not sound or not description["visits"]:
+        raise InputError(f"{path}: does not describe a chronology")
+    return description
+
+
+def _parse_arrays(content: bytes, path: Path) -> dict[str, np.ndarray]:
+    try:
+        return safetensors.numpy.load(content)
+    except (safetensors.SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: is not a whole safetensors file ({error})") from None
+
+
+class _Taker:
+    """Arrays by name, with the shape and kind that they must have."""
+
+    def __init__(self, arrays: dict[str, np.ndarray], path: Path):
+        self._arrays, self._path = arrays, path
+
+    def __call__(self, name: str, shape: tuple[int, ...], *, dtypes: tuple[str, ...] = _DTYPES):
+        array = self._arrays.get(name)
+        if array is None:
+            raise InputError(f"{self._path}: has no array {name}")
+        if array.shape != shape or array.dtype.name not in dtypes:
+            found = f"{array.dtype.name}{list(array.shape)}"
+            raise InputError(f"{self._path}: {name} is {found}, expected {dtypes[0]}{list(shape)}")
+        return jnp.asarray(array)
+
+    def splats(self, name: str, n: int) -> Splats:
+        """The splats under a name, any SH degree."""
+        k = self._arrays[f"{name}.sh"].shape[1:2] if f"{name}.sh" in self._arrays else ()
+        if k and math.isqrt(k[0]) ** 2 != k[0]:
+            raise InputError(f"{self._path}: {name}.sh has {k[0]} coefficients")
+        shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *k, 3))
+        return Splats(*(self(f"{name}.{field}", shape) for field, shape in zip(_SPLAT_FIELDS, shapes, strict=True)))
