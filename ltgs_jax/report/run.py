@@ -1,0 +1,171 @@
+"""What a finished run left on disk, as records; a file that is missing leaves its part empty."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from ltgs_jax.geometry import SE3
+from ltgs_jax.io import InputError, read_json
+
+CHANGES = ("added", "removed", "moved", "new_state")
+
+
+@dataclass(frozen=True)
+class State:
+    """One object at one visit, as in tracks.json; `pose` is world_from_template, None where it is not known."""
+
+    visit: int
+    event: str
+    visible: bool
+    pose: SE3 | None
+    confidence: float | None
+    ambiguous_axis: Any
+
+
+@dataclass(frozen=True)
+class Object:
+    """One object; `center` [3] and `size` (diagonal) of its template in scene units; `states` by visit."""
+
+    identity: int
+    source_visit: int
+    splats: int
+    center: jax.Array
+    size: float
+    states: dict[int, State]
+
+    def visible(self, visit: int) -> bool:
+        """Whether it is there at a visit."""
+        if visit in self.states:
+            return self.states[visit].visible
+        return visit == self.source_visit
+
+    def pose(self, visit: int) -> SE3 | None:
+        """Its pose at a visit; at its source visit the template's own frame unless tracks.json says otherwise."""
+        if visit in self.states:
+            return self.states[visit].pose
+        return SE3.identity() if visit == self.source_visit else None
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph of which the page shows images; paths are None where there is no such image."""
+
+    name: str
+    visit: int
+    role: str
+    capture: Path | None
+    render: Path | None
+    initial: Path | None
+    mask: Path | None
+    psnr: float | None
+    initial_psnr: float | None
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a photograph got its pose: `status` given, localized or rejected."""
+
+    name: str
+    status: str
+    inliers: int | None
+    reason: str | None
+
+
+@dataclass(frozen=True)
+class Run:
+    """All that the page shows."""
+
+    folder: Path
+    visits: tuple[str, ...]
+    objects: tuple[Object, ...]
+    shots: tuple[Shot, ...]
+    placements: tuple[Placement, ...]
+    metrics: list[dict]
+    stages: list[dict]
+    config: dict
+    env: dict
+
+
+def read_run(folder: Path) -> Run:
+    """Read the files of a chronology that the page needs.
+
+    Raises InputError that names the file when tracks.json is missing or a file is not what contract.md says.
+    """
+    tracks = read_json(folder / "tracks.json")
+    try:
+        visits = tuple(str(visit) for visit in tracks["visits"])
+        objects = tuple(_object(entry) for entry in tracks["objects"])
+        placements = tuple(
+            Placement(entry["name"], entry["status"], entry.get("inliers"), entry.get("reason"))
+            for entry in tracks.get("photographs", [])
+        )
+        if any(not 0 <= visit < len(visits) for entry in objects for visit in (entry.source_visit, *entry.states)):
+            raise ValueError("a visit beyond the list of visits")
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder / 'tracks.json'}: is not a list of tracks ({error})") from None
+    manifest = _optional(folder / "report.json", dict)
+    try:
+        shots = tuple(_shot(entry, folder, visits) for entry in manifest.get("photographs", []))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{folder / 'report.json'}: is not a list of photographs ({error})") from None
+    return Run(
+        folder=folder,
+        visits=visits,
+        objects=objects,
+        shots=shots,
+        placements=placements,
+        metrics=_optional(folder / "metrics.json", list),
+        stages=_optional(folder / "stages.json", list),
+        config=_optional(folder / "config.json", dict),
+        env=_optional(folder / "env.json", dict),
+    )
+
+
+def _optional(path: Path, expected: type) -> Any:
+    return read_json(path, expected) if path.exists() else expected()
+
+
+def _object(entry: dict) -> Object:
+    return Object(
+        identity=int(entry["id"]),
+        source_visit=int(entry["source_visit"]),
+        splats=int(entry["splats"]),
+        center=jnp.asarray(entry["center"], jnp.float32).reshape(3),
+        size=float(entry["size"]),
+        states={int(state["visit"]): _state(state) for state in entry["states"]},
+    )
+
+
+def _state(entry: dict) -> State:
+    pose = entry.get("world_from_template")
+    if pose is not None:
+        pose = SE3(*(jnp.asarray(pose[key], jnp.float32).reshape(size) for key, size in (("wxyz", 4), ("xyz", 3))))
+    return State(
+        visit=int(entry["visit"]),
+        event=str(entry["event"]),
+        visible=bool(entry["visible"]),
+        pose=pose,
+        confidence=entry.get("confidence"),
+        ambiguous_axis=entry.get("ambiguous_axis"),
+    )
+
+
+def _shot(entry: dict, folder: Path, visits: tuple[str, ...]) -> Shot:
+    def path(key: str) -> Path | None:
+        return folder / entry[key] if entry.get(key) else None  # an absolute path stays as it is
+
+    visit = entry["visit"]
+    return Shot(
+        name=str(entry["name"]),
+        visit=visit if isinstance(visit, int) else visits.index(visit),
+        role=str(entry.get("role", "")),
+        capture=path("capture_path"),
+        render=path("render_path"),
+        initial=path("initial_render_path"),
+        mask=path("mask_path"),
+        psnr=entry.get("psnr"),
+        initial_psnr=entry.get("initial_psnr"),
+    )
