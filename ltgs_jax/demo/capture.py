@@ -1,5 +1,6 @@
 """A made-up capture with known truth, written as contract.md says."""
 
+import dataclasses
 import functools
 import os
 from concurrent.futures import ThreadPoolExecutor
@@ -65,25 +66,27 @@ def make_capture(
         else sparse_views(rng, update) + dense_views(rng, test)
         for t in range(len(names))
     ]
-    exposure, model = None, None
+    stages: list[tuple[Caster, np.ndarray, Shader]] = []
+    first: list[np.ndarray] = []
+    exposure = 1.0
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for t, visit in enumerate(names):
             if t == 0 or story.visits[t] != story.visits[t - 1]:
                 caster, owners = _set_stage(story, t, room)
-                shader = Shader(caster, light_vertices(caster, lights))
-            films = list(pool.map(lambda view, c=caster, s=shader: _shoot(c, s, view, lens), views[t]))
-            if exposure is None:
+                stages.append((caster, owners, Shader(caster, light_vertices(caster, lights))))
+            caster, owners, shader = stages[-1]
+            films = list(pool.map(functools.partial(_shoot, caster, shader, lens), views[t]))
+            if t == 0:
                 exposure = 0.88 / np.percentile(np.concatenate([film.reshape(-1, 3) for film in films]), 97.0)
-            photographs = []
             for i, film in enumerate(films):
-                look = np.random.default_rng([seed, 11, t, i])
-                image = _develop(film * exposure, look, changed_light=scene == "light" and t > 0)
-                photographs.append(image)
+                sensor = np.random.default_rng([seed, 11, t, i])
+                image = _develop(film * exposure, sensor, changed_light=scene == "light" and t > 0)
                 write_image(folder / "images" / visit / f"{i:03d}.png", image)
                 ids = _owner_image(caster, owners, views[t][i], lens)
                 write_labels(folder / "truth" / "masks" / visit / f"{i:03d}.png", ids)
-            if t == 0:
-                model = _sparse_points(caster, views[0][:dense], photographs[:dense], lens, visit, rng, points)
+                if t == 0 and i < dense:
+                    first.append(image)
+    model = _sparse_points(stages[0][0], views[0][:dense], first, lens, rng, points)
     write_colmap(folder / "sparse" / "0", _with_all_views(model, names, views, lens))
     _write_lists(folder, names, views, dense, update)
     write_json(folder / "truth" / "objects.json", _truth(story))
@@ -116,7 +119,7 @@ def _rays(view: View, lens: CameraModel, per_side: int) -> tuple[np.ndarray, np.
     return np.broadcast_to(view.centre.astype(np.float32), directions.shape), directions
 
 
-def _shoot(caster: Caster, shader: Shader, view: View, lens: CameraModel) -> np.ndarray:
+def _shoot(caster: Caster, shader: Shader, lens: CameraModel, view: View) -> np.ndarray:
     """Linear radiance [h w 3], averaged over the samples of each pixel."""
     k = _SUPERSAMPLES
     radiance = shader(caster.cast(*_rays(view, lens, k)))
@@ -142,7 +145,14 @@ def _develop(film: np.ndarray, rng: np.random.Generator, *, changed_light: bool)
     return image + _NOISE * rng.standard_normal(image.shape)
 
 
-def _sparse_points(caster, views, photographs, lens, visit, rng, count) -> ColmapModel:
+def _sparse_points(
+    caster: Caster,
+    views: list[View],
+    photographs: list[np.ndarray],
+    lens: CameraModel,
+    rng: np.random.Generator,
+    count: int,
+) -> ColmapModel:
     """Points on textured surfaces that at least two of the views see, with colours and noisy observations."""
     candidates, colors = [], []
     for view, image in zip(views, photographs, strict=True):
@@ -169,8 +179,9 @@ def _sparse_points(caster, views, photographs, lens, visit, rng, count) -> Colma
     images, track = {}, []
     for i, view in enumerate(views):
         mine = np.flatnonzero(seen_in[i, kept])
-        name = f"{visit}/{i:03d}.png"
-        images[i + 1] = ColmapImage(name, 1, *view.cam_from_world(), pixels[i, kept[mine]], mine + 1)
+        quat, xyz = view.cam_from_world()
+        # _with_all_views, which knows the visits' names, gives it its name.
+        images[i + 1] = ColmapImage("", 1, quat, xyz, pixels[i, kept[mine]], mine + 1)
         track.append(np.column_stack([mine, np.full(len(mine), i + 1), np.arange(len(mine))]))
     rows = np.concatenate(track)
     return ColmapModel(
@@ -185,14 +196,17 @@ def _sparse_points(caster, views, photographs, lens, visit, rng, count) -> Colma
 
 
 def _with_all_views(model: ColmapModel, names: list[str], views: list[list[View]], lens: CameraModel) -> ColmapModel:
-    """The model with a pose for every photograph."""
-    images = dict(model.images)
-    for visit, group in zip(names, views, strict=True):
+    """The model with a name and a pose for every photograph."""
+    images = {}
+    for t, (visit, group) in enumerate(zip(names, views, strict=True)):
         for i, view in enumerate(group):
-            if visit != names[0] or i + 1 not in images:
-                none = np.zeros((0, 2)), np.zeros(0, np.int64)
-                images[len(images) + 1] = ColmapImage(f"{visit}/{i:03d}.png", 1, *view.cam_from_world(), *none)
-    return ColmapModel({1: lens}, images, model.point_ids, model.points, model.colors, model.errors, model.track)
+            name = f"{visit}/{i:03d}.png"
+            if t == 0 and i + 1 in model.images:
+                images[i + 1] = dataclasses.replace(model.images[i + 1], name=name)
+            else:
+                quat, xyz = view.cam_from_world()
+                images[len(images) + 1] = ColmapImage(name, 1, quat, xyz, np.zeros((0, 2)), np.zeros(0, np.int64))
+    return dataclasses.replace(model, images=images)
 
 
 def _write_lists(folder: Path, names: list[str], views: list[list[View]], dense: int, update: int) -> None:

@@ -125,9 +125,10 @@ def _house(rng: np.random.Generator, scale: float) -> Mesh:
         face: tx.gable(rng, th, length, colors)
         for face, length in zip(("front", "right", "back", "left"), (tw, td) * 2, strict=True)
     }
-    slope = [w + 2 * over, 0, 0], [0, -d / 2 - over, -roof * (1 + 2 * over / d)]
-    cladding = tx.tiles(rng, *_texels(np.hypot(d / 2, roof), w), colors[3])
-    front = rectangle((-w / 2 - over, 0, h + roof), *slope, cladding, cell=CELL)
+    along, down = (w + 2 * over, 0, 0), (0, -d / 2 - over, -roof * (1 + 2 * over / d))
+    roof_high, roof_wide = _texels(np.hypot(d / 2, roof), w)
+    cladding = tx.tiles(rng, roof_high, roof_wide, colors[3])
+    front = rectangle((-w / 2 - over, 0, h + roof), along, down, cladding, cell=CELL)
     turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     gables = [_gable_end(sign * w / 2, d, h, roof, tx.plain(rng, 40, 60, (222, 200, 170)), sign) for sign in (1, -1)]
     return join([box((w, d, h), walls, cell=CELL), front, front.moved(turn), *gables])

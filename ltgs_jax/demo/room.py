@@ -79,7 +79,7 @@ def _table(rng: np.random.Generator) -> list[Mesh]:
     parts = [box((w, d, thickness), faces, cell=0.014, base=(0, 0, TABLE_TOP - thickness))]
     for x in (-w / 2 + 0.06, w / 2 - 0.06):
         for y in (-d / 2 + 0.06, d / 2 - 0.06):
-            legs = dict.fromkeys(("front", "back", "left", "right"), edge.swapaxes(0, 1))
+            legs = {face: edge.swapaxes(0, 1) for face in ("front", "back", "left", "right")}
             parts.append(box((0.06, 0.06, TABLE_TOP - thickness), legs, cell=0.04, base=(x, y, 0)))
     mat = tx.rug(rng, 150, 220, tx.palette(rng))
     x, y = rng.uniform(-0.28, 0.02), rng.uniform(0.0, 0.1)

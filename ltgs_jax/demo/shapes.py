@@ -41,7 +41,7 @@ def join(meshes: list[Mesh]) -> Mesh:
 
 
 def surface(points: np.ndarray, texture: np.ndarray) -> Mesh:
-    """A grid of points [rows columns 3] as a mesh; the normal is ∂columns × ∂rows... up to orientation: right × up.
+    """A grid of points [rows columns 3] as a mesh; the normal is right × up.
 
     Row 0 is the texture's first row (its top), column 0 its left; seen from outside, right × up points outwards.
     """
@@ -92,7 +92,11 @@ def box(size, textures: dict[str, np.ndarray], *, cell: float, base=(0.0, 0.0, 0
         "top": ((left, back, high), (w, 0, 0), (0, -d, 0)),
         "bottom": ((left, front, low), (w, 0, 0), (0, d, 0)),
     }
-    return join([rectangle(*frames[face], texture, cell=cell) for face, texture in textures.items()])
+    parts = []
+    for face, texture in textures.items():
+        corner, along, down = frames[face]
+        parts.append(rectangle(corner, along, down, texture, cell=cell))
+    return join(parts)
 
 
 def lathe(profile, texture: np.ndarray, *, cell: float, segments: int = 36, inside: bool = False) -> Mesh:

@@ -2,10 +2,6 @@
 
 from .capture import Capture as Capture
 from .capture import Observations as Observations
-from .capture import Photograph as Photograph
-from .capture import distort_labels as distort_labels
-from .capture import load_image as load_image
-from .capture import load_mask as load_mask
 from .capture import read_capture as read_capture
 from .chronology import load_chronology as load_chronology
 from .chronology import save_chronology as save_chronology
@@ -20,11 +16,17 @@ from .files import read_json as read_json
 from .files import replacing as replacing
 from .files import write_bytes as write_bytes
 from .files import write_json as write_json
+from .images import as_rgb as as_rgb
 from .images import read_labels as read_labels
+from .images import read_pixels as read_pixels
 from .images import scaled_size as scaled_size
 from .images import write_image as write_image
 from .images import write_labels as write_labels
 from .lens import CameraModel as CameraModel
+from .photographs import Photograph as Photograph
+from .photographs import distort_labels as distort_labels
+from .photographs import load_image as load_image
+from .photographs import load_mask as load_mask
 from .ply import read_ply as read_ply
 from .ply import write_ply as write_ply
 from .tracks import read_tracks as read_tracks

@@ -132,17 +132,17 @@ def undistort_image(image: np.ndarray, lens: CameraModel | None, K: np.ndarray |
     """The image [h w c] as a pinhole camera with `K` takes it; pixels outside the photograph become 0."""
     if lens is None or K is None or is_pinhole(lens, K):
         return image
-    return cv2.remap(image, undistort_map(lens, K), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    x, y = np.moveaxis(undistort_map(lens, K), -1, 0)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
 def undistort_mask(mask: Bool[np.ndarray, "h w"], lens: CameraModel | None, K: np.ndarray | None) -> np.ndarray:
     """The mask [h w] of the pinhole image: False outside the photograph too."""
     if lens is None or K is None or is_pinhole(lens, K):
         return mask
-    source = undistort_map(lens, K)
-    near = cv2.remap(mask.astype(np.uint8), source, None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    x, y = np.moveaxis(undistort_map(lens, K), -1, 0)
+    near = cv2.remap(mask.astype(np.uint8), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
     half = 0.5
-    x, y = source[..., 0], source[..., 1]
     inside = (x >= -half) & (x <= lens.width - half) & (y >= -half) & (y <= lens.height - half)
     return (near > 0) & inside
 
@@ -153,8 +153,8 @@ def lay_labels(
     """Labels of the pinhole image with `K`, laid on the distorted photograph of `lens`; 0 outside."""
     if lens is None or K is None or is_pinhole(lens, K):
         return labels
-    narrow = labels.astype(np.uint16)
-    return cv2.remap(narrow, distort_map(lens, K), None, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
+    x, y = np.moveaxis(distort_map(lens, K), -1, 0)
+    return cv2.remap(labels.astype(np.uint16), x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT)
 
 
 def scaled_size(width: int, height: int, max_side: int | None) -> tuple[int, int]:

@@ -168,8 +168,8 @@ def write_ply(path: str | Path, splats: Splats) -> None:
 
     Raises InputError when the file cannot be written.
     """
+    sh_degree(splats.sh)
     sh = np.asarray(splats.sh, np.float32)
-    sh_degree(sh)
     rest = (sh.shape[1] - 1) * 3
     blocks = (
         (("x", "y", "z"), splats.means),

@@ -23,7 +23,7 @@ _TYPES: dict[str, tuple[type, ...]] = {
 @functools.cache
 def tracks_schema() -> dict:
     """The JSON Schema of tracks.json, which the package carries as tracks.schema.json."""
-    return json.loads(importlib.resources.files(__package__).joinpath("tracks.schema.json").read_text())
+    return json.loads(importlib.resources.files("ltgs_jax.io").joinpath("tracks.schema.json").read_text())
 
 
 def write_tracks(path: str | Path, *, visits: list[str], photographs: list[dict], objects: list[dict]) -> None:
