@@ -27,9 +27,9 @@ RANKS = {
     "template": 4,
     "fit": 4,
     "pipeline": 5,
-    "view": 6,
     "report": 6,
-    "cli": 7,  # starts the viewer and writes the report
+    "view": 7,  # says what happened in the report's words
+    "cli": 8,  # starts the viewer and writes the report
 }
 HEART = {"geometry", "scene", "metrics", "render", "register", "template", "fit"}
 JAX_STACK = {"jax", "equinox", "jaxtyping", "optax", "optimistix", "lineax", "numpy", "scipy"}

@@ -1,3 +1,3 @@
-"""Rank 7: the `ltgs` command."""
+"""Rank 8: the `ltgs` command."""
 
 from .main import main as main

@@ -23,8 +23,8 @@ def write_report(folder: str | Path) -> Path:
     """Write `report.html` from what is in the folder of a chronology (contract.md, "Out"); returns its path.
 
     Images are found through `report.json`: {"photographs": [{"name", "visit", "role", "capture_path", "render_path",
-    "initial_render_path", "mask_path", "psnr", "initial_psnr"}]}, paths absolute or relative to the folder, anything
-    but name and visit may be missing.
+    "initial_render_path", "mask_path", "psnr", "initial_psnr", "camera": {"K", "cam_from_world": {"wxyz", "xyz"},
+    "width", "height"}}]}, paths absolute or relative to the folder; anything but name and visit may be missing.
 
     Raises InputError that names the file when one is not what it should be, or the page cannot be written.
     """

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ltgs_jax.geometry import SE3
+from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, read_json
 
 CHANGES = ("added", "removed", "moved", "new_state")
@@ -51,7 +51,7 @@ class Object:
 
 @dataclass(frozen=True)
 class Shot:
-    """One photograph of which the page shows images; paths are None where there is no such image."""
+    """One photograph of which there are images to show; a path is None where there is no such image."""
 
     name: str
     visit: int
@@ -62,6 +62,7 @@ class Shot:
     mask: Path | None
     psnr: float | None
     initial_psnr: float | None
+    camera: Camera | None
 
 
 @dataclass(frozen=True)
@@ -141,13 +142,11 @@ def _object(entry: dict) -> Object:
 
 def _state(entry: dict) -> State:
     pose = entry.get("world_from_template")
-    if pose is not None:
-        pose = SE3(*(jnp.asarray(pose[key], jnp.float32).reshape(size) for key, size in (("wxyz", 4), ("xyz", 3))))
     return State(
         visit=int(entry["visit"]),
         event=str(entry["event"]),
         visible=bool(entry["visible"]),
-        pose=pose,
+        pose=None if pose is None else _motion(pose),
         confidence=entry.get("confidence"),
         ambiguous_axis=entry.get("ambiguous_axis"),
     )
@@ -168,4 +167,14 @@ def _shot(entry: dict, folder: Path, visits: tuple[str, ...]) -> Shot:
         mask=path("mask_path"),
         psnr=entry.get("psnr"),
         initial_psnr=entry.get("initial_psnr"),
+        camera=None if entry.get("camera") is None else _camera(entry["camera"]),
     )
+
+
+def _camera(entry: dict) -> Camera:
+    K = jnp.asarray(entry["K"], jnp.float32).reshape(3, 3)
+    return Camera(_motion(entry["cam_from_world"]), K, int(entry["width"]), int(entry["height"]))
+
+
+def _motion(entry: dict) -> SE3:
+    return SE3(jnp.asarray(entry["wxyz"], jnp.float32).reshape(4), jnp.asarray(entry["xyz"], jnp.float32).reshape(3))
