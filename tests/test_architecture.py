@@ -40,6 +40,7 @@ FOREIGN = {
     "localize": {"cv2", "pycolmap"},
     "detect": {"cv2", "skimage"},
     "match": {"cv2", "skimage"},
+    "pipeline": {"cv2"},
     "cli": {"tyro", "rich"},
     "report": {"cv2"},
     "demo": {"cv2"},
@@ -50,7 +51,6 @@ LAZY = {
     "io": {"trimesh"},
     "demo": {"trimesh", "embreex"},
     "view": {"viser", "cv2"},
-    "pipeline": {"cv2"},
 }
 
 

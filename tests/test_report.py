@@ -97,7 +97,8 @@ def chronology(tmp_path):
     ]  # fmt: skip
     for name, value in {
         "tracks": tracks, "metrics": rows, "stages": stages, "report": {"photographs": photographs},
-        "config": {"capture": "/somewhere/kitchen", "fit": {"steps": 5}}, "env": {"jax": "0.10.2"},
+        "config": {"fit": {"steps": 5}},
+        "cameras": {"capture": "/somewhere/kitchen", "photographs": {}}, "env": {"jax": "0.10.2"},
     }.items():  # fmt: skip
         (tmp_path / f"{name}.json").write_text(json.dumps(value))
     return tmp_path
@@ -199,6 +200,7 @@ def test_photographs_that_cannot_be_read_are_no_fault(chronology):
         ("tracks", "[1"),
         ("tracks", '{"visits": ["a"], "objects": [{"id": 1}]}'),
         ("report", '{"photographs": [{}]}'),
+        ("cameras", '{"photographs": {"a": {"K": 1}}}'),
     ],
 )
 def test_a_broken_file_is_named(chronology, name, content):

@@ -66,10 +66,11 @@ def folder(tmp_path):
     ]
     K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     camera = {"K": K, "width": WIDTH, "height": HEIGHT, "cam_from_world": _pose()}
-    photographs = [{"name": f"{visit}/0.png", "visit": visit, "role": "update", "camera": camera} for visit in VISITS]
+    photographs = [{"name": f"{visit}/0.png", "visit": visit, "role": "update"} for visit in VISITS]
     files = {
         "tracks": {"version": 1, "visits": VISITS, "photographs": [], "objects": objects},
         "report": {"photographs": photographs},
+        "cameras": {"capture": "/somewhere", "photographs": {entry["name"]: camera for entry in photographs}},
     }
     for name, value in files.items():
         (tmp_path / f"{name}.json").write_text(json.dumps(value))

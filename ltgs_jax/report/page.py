@@ -23,8 +23,8 @@ def write_report(folder: str | Path) -> Path:
     """Write `report.html` from what is in the folder of a chronology (contract.md, "Out"); returns its path.
 
     Images are found through `report.json`: {"photographs": [{"name", "visit", "role", "capture_path", "render_path",
-    "initial_render_path", "mask_path", "psnr", "initial_psnr", "camera": {"K", "cam_from_world": {"wxyz", "xyz"},
-    "width", "height"}}]}, paths absolute or relative to the folder; anything but name and visit may be missing.
+    "initial_render_path", "mask_path", "psnr", "initial_psnr"}]}, paths absolute or relative to the folder; anything
+    but name and visit may be missing.
 
     Raises InputError that names the file when one is not what it should be, or the page cannot be written.
     """
@@ -50,7 +50,7 @@ def page(run: Run, gallery: Gallery) -> str:
     sections = [(anchor, title, body) for anchor, title, body in sections if body]
     links = "".join(f'<a href="#{anchor}">{title}</a>' for anchor, title, _ in sections)
     bodies = "".join(f'<section id="{anchor}"><h2>{title}</h2>{body}</section>' for anchor, title, body in sections)
-    title = f"What changed: {_capture_name(run)}"
+    title = f"What changed: {run.capture}"
     static = files("ltgs_jax.report") / "static"
     css, script = ((static / name).read_text(encoding="utf-8") for name in ("report.css", "report.js"))
     return (
@@ -60,11 +60,6 @@ def page(run: Run, gallery: Gallery) -> str:
         f'<h1>{escape(title)}</h1><p>{escape(summary(run))}</p><nav aria-label="Sections">{links}</nav>{bodies}'
         f"</main><script>{script}</script></body></html>\n"
     )
-
-
-def _capture_name(run: Run) -> str:
-    capture = run.config.get("capture") or run.env.get("capture")
-    return Path(capture).name if isinstance(capture, str) and capture else run.folder.resolve().name
 
 
 def _strip(run: Run, gallery: Gallery) -> str:

@@ -80,6 +80,7 @@ class Run:
     """All that the page shows."""
 
     folder: Path
+    capture: str
     visits: tuple[str, ...]
     objects: tuple[Object, ...]
     shots: tuple[Shot, ...]
@@ -107,13 +108,19 @@ def read_run(folder: Path) -> Run:
             raise ValueError("a visit beyond the list of visits")
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{folder / 'tracks.json'}: is not a list of tracks ({error})") from None
-    manifest = _optional(folder / "report.json", dict)
+    manifest, placed = _optional(folder / "report.json", dict), _optional(folder / "cameras.json", dict)
     try:
-        shots = tuple(_shot(entry, folder, visits) for entry in manifest.get("photographs", []))
+        cameras = {name: _camera(entry) for name, entry in placed.get("photographs", {}).items()}
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{folder / 'cameras.json'}: is not a list of cameras ({error})") from None
+    try:
+        shots = tuple(_shot(entry, folder, visits, cameras) for entry in manifest.get("photographs", []))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{folder / 'report.json'}: is not a list of photographs ({error})") from None
+    capture = placed.get("capture")
     return Run(
         folder=folder,
+        capture=Path(capture).name if isinstance(capture, str) else folder.resolve().name,
         visits=visits,
         objects=objects,
         shots=shots,
@@ -152,7 +159,7 @@ def _state(entry: dict) -> State:
     )
 
 
-def _shot(entry: dict, folder: Path, visits: tuple[str, ...]) -> Shot:
+def _shot(entry: dict, folder: Path, visits: tuple[str, ...], cameras: dict[str, Camera]) -> Shot:
     def path(key: str) -> Path | None:
         return folder / entry[key] if entry.get(key) else None  # an absolute path stays as it is
 
@@ -167,7 +174,7 @@ def _shot(entry: dict, folder: Path, visits: tuple[str, ...]) -> Shot:
         mask=path("mask_path"),
         psnr=entry.get("psnr"),
         initial_psnr=entry.get("initial_psnr"),
-        camera=None if entry.get("camera") is None else _camera(entry["camera"]),
+        camera=cameras.get(entry["name"]),
     )
 
 
