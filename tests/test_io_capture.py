@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import struct
+import zlib
 
 import cv2
 import jax.numpy as jnp
@@ -324,6 +326,17 @@ def test_two_sizes_with_one_camera(tmp_path):
     io.write_image(tmp_path / "images" / "IMG_0001" / "002.png", noise(16, 12))
     with pytest.raises(io.InputError, match=r"002\.png.*16×12 and 32×24"):
         io.read_capture(tmp_path)
+
+
+def test_hostile_image_sizes_are_not_believed(tmp_path):
+    make_capture(tmp_path)
+    path = tmp_path / "images" / "IMG_0001" / "001.png"
+    content = bytearray(path.read_bytes())
+    content[16:24] = struct.pack(">II", 15000, 15000)
+    content[29:33] = struct.pack(">I", zlib.crc32(bytes(content[12:29])))
+    path.write_bytes(content)
+    ((name, reason),) = io.read_capture(tmp_path).problems
+    assert name == "IMG_0001/001.png" and "15000×15000" in reason
 
 
 def test_phone_data_behind_the_end_of_a_jpeg_is_fine(tmp_path):

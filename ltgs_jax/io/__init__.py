@@ -9,6 +9,7 @@ from .colmap import ColmapImage as ColmapImage
 from .colmap import ColmapModel as ColmapModel
 from .colmap import find_colmap as find_colmap
 from .colmap import read_colmap as read_colmap
+from .colmap_export import export_colmap as export_colmap
 from .colmap_text import write_colmap as write_colmap
 from .files import InputError as InputError
 from .files import read_bytes as read_bytes
@@ -16,6 +17,7 @@ from .files import read_json as read_json
 from .files import replacing as replacing
 from .files import write_bytes as write_bytes
 from .files import write_json as write_json
+from .gltf import write_gltf as write_gltf
 from .images import as_rgb as as_rgb
 from .images import read_labels as read_labels
 from .images import read_pixels as read_pixels
@@ -29,6 +31,9 @@ from .photographs import load_image as load_image
 from .photographs import load_mask as load_mask
 from .ply import read_ply as read_ply
 from .ply import write_ply as write_ply
+from .splat_files import WRITERS as WRITERS
+from .splat_files import read_splats as read_splats
+from .splat_files import write_splats as write_splats
 from .tracks import read_tracks as read_tracks
 from .tracks import tracks_schema as tracks_schema
 from .tracks import write_tracks as write_tracks

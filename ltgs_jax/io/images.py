@@ -13,6 +13,7 @@ from .lens import CameraModel, distort_map, is_pinhole, undistort_map
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 _MOST_PIXELS = 1 << 28  # 268 megapixels: beyond any camera; a header that claims more is not believed
+_MOST_PIXELS_PER_BYTE = 4000  # an empty mask as PNG reaches 1000; beyond this the header is not believed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +43,9 @@ def read_header(path: Path) -> ImageHeader:
     spec = image.spec()
     image.close()
     width, height = spec.width, spec.height
-    if not (width > 0 and height > 0 and width * height <= _MOST_PIXELS):
-        raise InputError(f"{path}: claims {width}×{height} pixels")
+    size = path.stat().st_size
+    if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, _MOST_PIXELS_PER_BYTE * size)):
+        raise InputError(f"{path}: its header claims {width}×{height} pixels in {size} bytes")
     if _is_cut_short(path):
         raise InputError(f"{path}: is cut short")
     return ImageHeader(width, height, spec.nchannels, spec.get_int_attribute("Orientation", 1))

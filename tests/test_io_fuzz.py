@@ -1,0 +1,208 @@
+"""Damaged files, every reader: a one-line message that names the file, or a read; never anything else.
+
+The quick run damages each kind of file some dozens of ways; `-m slow` some hundreds. Each kind runs in a process of its
+own, so that a crash of a decoder, or memory beyond the limit, is a failure of one test.
+"""
+
+import json
+import random
+import re
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ltgs_jax import io
+from ltgs_jax.io import load_chronology, read_capture, read_colmap, read_splats
+from ltgs_jax.scene import Chronology, Splats
+
+SECONDS = 2.0
+MEGABYTES = 500
+
+
+def _splats(count: int = 40, degree: int = 1) -> Splats:
+    rng = np.random.default_rng(0)
+    shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, (degree + 1) ** 2, 3))
+    return Splats(*(jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes))
+
+
+def _spz_4(path: Path) -> None:
+    import zstandard
+
+    n = 40
+    columns = [
+        np.random.default_rng(i).integers(0, 256, n * w).astype(np.uint8).tobytes()
+        for i, w in enumerate((9, 1, 3, 3, 4))
+    ]
+    packed = [zstandard.compress(column) for column in columns]
+    head = b"NGSP" + np.array([4, n], "<u4").tobytes() + bytes([0, 12, 0, 5]) + np.array([32, 0, 0, 0], "<u4").tobytes()
+    table = np.array([(len(a), len(b)) for a, b in zip(packed, columns, strict=True)], "<u8").tobytes()
+    path.write_bytes(head + table + b"".join(packed))
+
+
+def _capture(folder: Path, suffix: str) -> None:
+    from test_io_capture import make_capture
+
+    make_capture(folder, (2, 1), suffix=suffix)
+    (folder / "images" / "changes.txt").write_text(f"IMG_0001/000{suffix}\n")
+    (folder / "images" / "test.txt").write_text(f"IMG_0000/001{suffix}\n")
+
+
+def _load_everything(folder: Path) -> None:
+    for photograph in read_capture(folder).photographs:
+        io.load_image(photograph)
+        io.load_mask(photograph)
+
+
+def _binary_colmap(folder: Path) -> None:
+    import zlib  # noqa: F401
+
+    import pycolmap
+    from test_io_colmap import make_model
+
+    io.write_colmap(folder / "text", make_model())
+    pycolmap.Reconstruction(str(folder / "text")).write_binary(str(folder))
+
+
+def _text_colmap(folder: Path) -> None:
+    from test_io_colmap import make_model
+
+    io.write_colmap(folder, make_model())
+
+
+def _transforms(folder: Path) -> None:
+    frames = []
+    for i in range(2):
+        io.write_image(folder / f"{i}.png", np.zeros((6, 8, 3)))
+        frames.append({"file_path": f"{i}.png", "time": i, "transform_matrix": np.eye(4).tolist()})
+    content = {"fl_x": 8.0, "w": 8, "h": 6, "k1": 0.1, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def _split(folder: Path) -> None:
+    for i in range(2):
+        io.write_image(folder / "images" / f"{i}.png", np.zeros((6, 8, 3)))
+    (folder / "sparse").mkdir()
+    (folder / "sparse" / "split.txt").write_text("0.png 0\n1.png 1\n")
+
+
+KINDS = {
+    "ply": ("a.ply", lambda f: io.write_ply(f / "a.ply", _splats()), lambda f: read_splats(f / "a.ply")),
+    "compressed-ply": (
+        "a.ply",
+        lambda f: io.write_splats(f / "a.ply", _splats(), form="compressed-ply"),
+        lambda f: read_splats(f / "a.ply"),
+    ),
+    "spz-3": ("a.spz", lambda f: io.write_splats(f / "a.spz", _splats()), lambda f: read_splats(f / "a.spz")),
+    "spz-4": ("a.spz", lambda f: _spz_4(f / "a.spz"), lambda f: read_splats(f / "a.spz")),
+    "splat": ("a.splat", lambda f: io.write_splats(f / "a.splat", _splats()), lambda f: read_splats(f / "a.splat")),
+    "cameras.bin": ("cameras.bin", _binary_colmap, read_colmap),
+    "images.bin": ("images.bin", _binary_colmap, read_colmap),
+    "points3D.bin": ("points3D.bin", _binary_colmap, read_colmap),
+    "cameras.txt": ("cameras.txt", _text_colmap, read_colmap),
+    "images.txt": ("images.txt", _text_colmap, read_colmap),
+    "points3D.txt": ("points3D.txt", _text_colmap, read_colmap),
+    "transforms.json": ("transforms.json", _transforms, _load_everything),
+    "split.txt": ("sparse/split.txt", _split, read_capture),
+    "changes.txt": ("images/changes.txt", lambda f: _capture(f, ".png"), read_capture),
+    "test.txt": ("images/test.txt", lambda f: _capture(f, ".png"), read_capture),
+    "chronology": (
+        "chronology.safetensors",
+        lambda f: io.save_chronology(f, Chronology.of_initial(_splats(), ("a", "b"))),
+        load_chronology,
+    ),
+    **{
+        f"photograph{suffix}": (f"images/IMG_0000/001{suffix}", lambda f, s=suffix: _capture(f, s), _load_everything)
+        for suffix in (".png", ".jpg", ".tif", ".webp", ".bmp", ".ppm")
+    },
+}
+"""The file that is damaged, what makes it and the rest, what reads it."""
+
+
+def damaged(whole: bytes, rng: random.Random) -> bytes:
+    """The file cut, bent in some bits, with a number blown up, a part doubled, lost or zeroed."""
+    content = bytearray(whole)
+    way = rng.randrange(6)
+    if way == 0:
+        return bytes(content[: rng.randrange(len(content))])
+    if way == 1:
+        for _ in range(rng.choice((1, 1, 4, 32))):
+            content[rng.randrange(len(content))] ^= 1 << rng.randrange(8)
+    elif way == 2:
+        numbers = [m.span() for m in re.finditer(rb"\d+", bytes(content[:4000]))]
+        if not numbers:
+            return bytes(content[: len(content) // 2])
+        a, b = rng.choice(numbers)
+        content[a:b] = rng.choice((b"0", b"-1", b"99999999999999999999", b"1e400", b"nan", b"4294967295", b"../../x"))
+    elif way == 3:
+        # The counts of binary headers lie near the beginning.
+        at = rng.randrange(max(1, min(len(content) - 8, 200)))
+        content[at : at + 8] = rng.choice(
+            (b"\xff" * 8, b"\0" * 8, b"\xff\xff\xff\x7f" + b"\0" * 4, b"\0" * 7 + b"\x7f")
+        )
+    elif way == 4:
+        a = rng.randrange(len(content))
+        content[a : a + rng.randrange(1, 200)] = b""
+    else:
+        a = rng.randrange(len(content))
+        content[a:a] = content[: rng.randrange(1, 200)]
+    return bytes(content)
+
+
+def run(kind: str, folder: Path, rounds: int) -> None:
+    """Damage, read, judge; runs in its own process."""
+    name, make, read = KINDS[kind]
+    make(folder)
+    read(folder)
+    path = folder / name
+    whole = path.read_bytes()
+    before = sorted(folder.parent.rglob("*"))
+    start_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for seed in range(rounds):
+        path.write_bytes(damaged(whole, random.Random(seed)))
+        start = time.process_time()
+        try:
+            read(folder)
+        except io.InputError as error:
+            message = str(error)
+            assert "\n" not in message and str(folder) in message and len(message) < 1000, (seed, message)
+        except Exception as error:
+            raise AssertionError(f"{kind}, seed {seed}: {error!r}") from error
+        assert time.process_time() - start < SECONDS, f"{kind}, seed {seed}: too slow"
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - start_memory) / 1024
+    assert grown < MEGABYTES, f"{kind}: {grown:.0f} MB more"
+    path.write_bytes(whole)
+    assert sorted(folder.parent.rglob("*")) == before
+
+
+def _in_a_process(kind: str, folder: Path, rounds: int) -> None:
+    if kind == "spz-4":
+        pytest.importorskip("zstandard")
+    (folder / "inside").mkdir()
+    code = f"import pathlib, test_io_fuzz as t; t.run({kind!r}, pathlib.Path({str(folder / 'inside')!r}), {rounds})"
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    script = f"import sys; sys.path[:0] = {paths!r}; {code}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, f"exit {done.returncode}: {done.stderr[-2000:]}"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files(tmp_path, kind):
+    if kind.startswith("photograph"):
+        _in_a_process(kind, tmp_path, 25)
+        return
+    if kind == "spz-4":
+        pytest.importorskip("zstandard")
+    (tmp_path / "inside").mkdir()
+    run(kind, tmp_path / "inside", 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_many_ways(tmp_path, kind):
+    _in_a_process(kind, tmp_path, 1500)
