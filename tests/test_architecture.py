@@ -48,8 +48,8 @@ FOREIGN = {
 LAZY = {
     "metrics": {"OpenImageIO", "onnxruntime"},
     "features": {"onnxruntime"},
-    "io": {"trimesh"},
-    "demo": {"trimesh", "embreex"},
+    "io": {"zstandard"},
+    "demo": {"embreex"},
     "view": {"viser", "cv2"},
 }
 

@@ -4,6 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ltgs_jax.geometry import Camera
+
 from .capture import Capture
 from .colmap import ColmapImage, ColmapModel
 from .colmap_text import write_colmap
@@ -29,7 +31,7 @@ def export_colmap(folder: str | Path, capture: Capture) -> None:
         quat = np.asarray(pose.quat, np.float64)
         images[identity] = ColmapImage(
             name=photograph.name,
-            camera_id=cameras.setdefault(_lens(photograph), len(cameras) + 1),
+            camera_id=cameras.setdefault(_lens(photograph, photograph.camera), len(cameras) + 1),
             quat=quat / np.linalg.norm(quat),
             xyz=np.asarray(pose.xyz, np.float64),
             pixels=seen.pixels[mine],
@@ -49,10 +51,10 @@ def export_colmap(folder: str | Path, capture: Capture) -> None:
     write_colmap(folder, model)
 
 
-def _lens(photograph: Photograph) -> CameraModel:
+def _lens(photograph: Photograph, camera: Camera) -> CameraModel:
     """The lens of a posed photograph; a pinhole where none is known."""
     if photograph.camera_model is not None:
         return photograph.camera_model
-    K = np.asarray(photograph.camera.K, np.float64)
+    K = np.asarray(camera.K, np.float64)
     params = tuple(float(v) for v in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
     return CameraModel("PINHOLE", photograph.width, photograph.height, params)

@@ -86,7 +86,7 @@ def write_splat(path: str | Path, splats: Splats) -> None:
     table = np.empty(splats.count, _RECORD)
     table["mean"] = np.asarray(splats.means)
     table["scale"] = np.exp(np.asarray(splats.log_scales, np.float64))
-    table["rgba"][:, :3] = to_byte(color_of_sh(splats.sh[:, 0]) * 255)
+    table["rgba"][:, :3] = to_byte(color_of_sh(np.asarray(splats.sh[:, 0])) * 255)
     table["rgba"][:, 3] = byte_of_logit(np.asarray(splats.logit_opacities))
     table["quat"] = to_byte(unit * 128 + 128)
     write_bytes(path, table.tobytes())

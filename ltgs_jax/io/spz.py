@@ -111,7 +111,9 @@ def _zstd_columns(content: bytes, sizes: list[int], streams: int, path: str | Pa
     try:
         import zstandard
     except ImportError:
-        raise InputError(f"{path}: SPZ of version 4 needs the package zstandard: pip install zstandard") from None
+        raise InputError(
+            f"{path}: SPZ of version 4 needs the package zstandard: pip install 'ltgs-jax[formats]'"
+        ) from None
     if len(content) < 32:
         raise InputError(f"{path}: is cut short within its header")
     (table,) = struct.unpack_from("<I", content, 16)
