@@ -5,6 +5,7 @@ from .dense import dense_descriptors as dense_descriptors
 from .keypoints import epipolar_distances as epipolar_distances
 from .keypoints import inside as inside
 from .keypoints import match_descriptors as match_descriptors
+from .keypoints import match_indices as match_indices
 from .keypoints import root_sift as root_sift
 from .proposals import segment_proposals as segment_proposals
 from .protocol import Correspondences as Correspondences

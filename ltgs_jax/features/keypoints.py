@@ -38,8 +38,12 @@ def epipolar_distances(
 ) -> Float[np.ndarray, "m n"]:
     """Distance in pixels of every b from the epipolar line of every a, x_bᵀ·F·x_a = 0."""
     lines = np.concatenate([xy_a, np.ones_like(xy_a[:, :1])], axis=1) @ np.asarray(fundamental, np.float64).T
-    scale = np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
-    return np.abs((lines / scale) @ np.concatenate([xy_b, np.ones_like(xy_b[:, :1])], axis=1).T)
+    lines /= np.maximum(np.linalg.norm(lines[:, :2], axis=1, keepdims=True), 1e-12)
+    # Normalised in float64, then float32 is good to 1e-3 px and twice as fast.
+    lines = lines.astype(np.float32)
+    distances = lines[:, :2] @ np.asarray(xy_b, np.float32).T
+    distances += lines[:, 2:]
+    return np.abs(distances, out=distances)
 
 
 def _best_elsewhere(
@@ -55,7 +59,7 @@ def _best_elsewhere(
     return np.max(np.where(same_place, -1, np.take_along_axis(cosine, top, axis=1)), axis=1, initial=-1)
 
 
-def match_descriptors(
+def match_indices(
     a: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m d"]],
     b: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n d"]],
     *,
@@ -63,19 +67,18 @@ def match_descriptors(
     max_ratio: float = 0.85,
     min_cosine: float = 0.6,
     epipolar_px: float = 3.0,
-) -> Correspondences:
-    """Mutual nearest neighbours that pass Lowe's ratio test in both directions.
+) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Mutual nearest neighbours that pass Lowe's ratio test in both directions: indices and cosines, best first.
 
     Args: positions and unit descriptors of the two images; `fundamental` restricts the candidates (and the runner-up
     of the ratio test) to `epipolar_px` pixels about the epipolar line. `max_ratio` compares Euclidean distances.
     """
     (xy_a, desc_a), (xy_b, desc_b) = a, b
-    empty = Correspondences(np.zeros((0, 2), np.float32), np.zeros((0, 2), np.float32), np.zeros(0, np.float32))
     if len(xy_a) == 0 or len(xy_b) == 0:
-        return empty
+        return np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32)
     cosine = desc_a @ desc_b.T
     if fundamental is not None:
-        cosine = np.where(epipolar_distances(xy_a, xy_b, fundamental) <= epipolar_px, cosine, np.float32(-1))
+        cosine[epipolar_distances(xy_a, xy_b, fundamental) > epipolar_px] = -1
     best = np.argmax(cosine, axis=1)
     rows = np.arange(len(xy_a))
     score = cosine[rows, best]
@@ -90,4 +93,14 @@ def match_descriptors(
     rows, best = rows[order], best[order]
     _, first = np.unique(np.concatenate([xy_a[rows], xy_b[best]], axis=1), axis=0, return_index=True)
     first.sort()
-    return Correspondences(xy_a[rows][first], xy_b[best][first], np.clip(score[order][first], 0, 1))
+    return rows[first], best[first], np.clip(score[order][first], 0, 1)
+
+
+def match_descriptors(
+    a: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m d"]],
+    b: tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n d"]],
+    **options,
+) -> Correspondences:
+    """`match_indices` as positions; the same options."""
+    rows, columns, score = match_indices(a, b, **options)
+    return Correspondences(a[0][rows], b[0][columns], score)
