@@ -198,7 +198,7 @@ def test_xfeat_finds_a_known_warp(shared):
     error = np.linalg.norm(found.xy_b - (found.xy_a @ warp[:, :2].T + warp[:, 2]), axis=1)
     assert len(found) > 150
     assert np.mean(error < 3) > 0.7
-    assert np.median(error) < 1.5
+    assert np.median(error) < 2
     # The model's input is 1.5 × 1.125 times smaller than the photograph; half a pixel's bias would show here.
     assert np.linalg.norm(np.median(found.xy_b - (found.xy_a @ warp[:, :2].T + warp[:, 2]), axis=0)) < 0.4
 

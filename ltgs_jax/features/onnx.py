@@ -166,7 +166,7 @@ class Onnx:
     stride: int = 8
     max_keypoints: int = 4096
     min_score: float = 0.05
-    max_ratio: float = 0.95
+    max_ratio: float = 0.9
     min_cosine: float = 0.8
     epipolar_px: float = 4.0
 
