@@ -8,4 +8,5 @@ from .pictures import read_shown as read_shown
 from .run import Run as Run
 from .run import Shot as Shot
 from .run import read_run as read_run
+from .turntable import up_direction as up_direction
 from .words import happenings as happenings

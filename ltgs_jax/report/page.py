@@ -7,12 +7,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from ltgs_jax.io import write_bytes
+from ltgs_jax.io import load_chronology, write_bytes
 
-from .pictures import css_color
+from .pictures import css_color, webp
 from .run import Object, Placement, Run, read_run
 from .shots import Gallery, make_gallery
 from .timeline import legend, timeline
+from .turntable import turntable, up_direction
 from .words import Happening, counted, duration, happenings, number, summary
 
 _LOW_CONFIDENCE = 0.5
@@ -28,19 +29,29 @@ def write_report(folder: str | Path) -> Path:
 
     Raises InputError that names the file when one is not what it should be, or the page cannot be written.
     """
-    run = read_run(Path(folder))
-    path = Path(folder) / "report.html"
-    write_bytes(path, page(run, make_gallery(run)).encode())
+    folder = Path(folder)
+    run, path = read_run(folder), folder / "report.html"
+    write_bytes(path, page(run, make_gallery(run), _sides(folder, run)).encode())
     return path
 
 
-def page(run: Run, gallery: Gallery) -> str:
+def _sides(folder: Path, run: Run) -> dict[int, list[str]]:
+    """Data URLs of each object alone, by id; its last template where it has several."""
+    if not (folder / "chronology.safetensors").exists():
+        return {}
+    chronology = load_chronology(folder)
+    images = turntable(chronology, up_direction([shot.camera for shot in run.shots if shot.camera is not None]))
+    pairs = zip(chronology.templates, images, strict=True)
+    return {template.identity: [webp(image) for image in views] for template, views in pairs}
+
+
+def page(run: Run, gallery: Gallery, sides: dict[int, list[str]]) -> str:
     """The whole HTML text."""
     sections = [
         ("visits", "Visits", _strip(run, gallery)),
         ("happened", "What happened", _happened(run)),
         ("timeline", "Timeline", _timeline(run)),
-        ("objects", "Objects", _objects(run, gallery)),
+        ("objects", "Objects", _objects(run, gallery, sides)),
         ("photographs", "Photographs", _photographs(run, gallery)),
         ("scores", "Scores", _scores(run.metrics)),
         ("stages", "Time and memory", _stages(run.stages)),
@@ -108,7 +119,7 @@ def _timeline(run: Run) -> str:
     return f'<div class="card scroll">{timeline(run)}</div>{legend()}' if run.objects else ""
 
 
-def _objects(run: Run, gallery: Gallery) -> str:
+def _objects(run: Run, gallery: Gallery, sides: dict[int, list[str]]) -> str:
     if not run.objects:
         return '<p class="soft">No object was found to change.</p>'
     cards = []
@@ -119,6 +130,10 @@ def _objects(run: Run, gallery: Gallery) -> str:
         axes = {escape(str(s.ambiguous_axis)) for s in thing.states.values() if s.ambiguous_axis is not None}
         if axes:
             facts += f"; looks the same turned about {', '.join(sorted(axes))}"
+        alone = "".join(
+            f'<img src="{url}" alt="object {thing.identity} alone" loading="lazy">'
+            for url in sides.get(thing.identity, [])
+        )
         crops = gallery.crops.get(thing.identity, [])[:_MOST_CROPS]
         figures = "".join(
             f'<figure><div><img src="{crop.capture}" alt="photograph" loading="lazy">'
@@ -128,10 +143,12 @@ def _objects(run: Run, gallery: Gallery) -> str:
         )
         cards.append(
             f'<div class="card" id="object-{thing.identity}"><h3>{_name(thing)}</h3><p class="soft">{facts}</p>'
+            + (f'<div class="alone">{alone}</div>' if alone else "")
             + (f'<div class="crops">{figures}</div>' if figures else "")
             + "</div>"
         )
-    return f'<p class="soft">Photograph and render side by side.</p><div class="objects">{"".join(cards)}</div>'
+    words = "Each alone, from four sides; then cut out of the photographs, with the render beside."
+    return f'<p class="soft">{words}</p><div class="objects">{"".join(cards)}</div>'
 
 
 def _photographs(run: Run, gallery: Gallery) -> str:

@@ -65,6 +65,12 @@ def jpeg(image: Float[np.ndarray, "h w 3"]) -> str:
     return _data_url(".jpg", "image/jpeg", pixels[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
 
 
+def webp(image: Float[np.ndarray, "h w 4"]) -> str:
+    """A data URL of an image with straight alpha."""
+    pixels = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return _data_url(".webp", "image/webp", pixels[..., [2, 1, 0, 3]], [cv2.IMWRITE_WEBP_QUALITY, _JPEG_QUALITY])
+
+
 def difference(image: Float[np.ndarray, "h w 3"], other: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Where two images differ: black equal, bright by `_SATURATED_DIFFERENCE` or more."""
     level = np.abs(image - other).mean(axis=-1) / _SATURATED_DIFFERENCE

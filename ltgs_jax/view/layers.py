@@ -92,14 +92,6 @@ def viewpoint_of(camera: Camera) -> Viewpoint:
     )
 
 
-def up_direction(viewpoints: list[Viewpoint]) -> Float[np.ndarray, "3"]:
-    """What the photographers held upward, on the average; −y, COLMAP's habit, when nobody did."""
-    quats = [viewpoint.wxyz for viewpoint in viewpoints]
-    mean = -Rotation.from_quat(quats, scalar_first=True).as_matrix()[:, :, 1].mean(0) if quats else np.zeros(3)
-    length = np.linalg.norm(mean)
-    return mean / length if length > 1e-3 else np.array([0.0, -1.0, 0.0])
-
-
 def extent_of(layer: Layer) -> tuple[Float[np.ndarray, "3"], float]:
     """Middle of the splats and how far half of them reach from it, heedless of strays."""
     if not len(layer.centers):

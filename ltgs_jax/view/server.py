@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from ltgs_jax.io import load_chronology
-from ltgs_jax.report import Run, Shot, color_of, difference, fitted, happenings, read_run, read_shown
+from ltgs_jax.report import Run, Shot, color_of, difference, fitted, happenings, read_run, read_shown, up_direction
 from ltgs_jax.scene import Chronology
 
-from .layers import Layer, Viewpoint, extent_of, layer_of, place_at, up_direction, viewpoint_of
+from .layers import Layer, Viewpoint, extent_of, layer_of, place_at, viewpoint_of
 
 _SECONDS_OF_MOVING, _FRAMES_OF_MOVING = 0.8, 20
 _PANEL_IMAGE_WIDTH = 480
@@ -100,7 +100,7 @@ class Viewer:
         scene, chronology = self.server.scene, self._chronology
         background = layer_of(chronology.background)
         middle, reach = extent_of(background)
-        up = up_direction(list(self._viewpoints.values()))
+        up = up_direction([shot.camera for shot in self._shots if shot.camera is not None])
         scene.set_up_direction(tuple(up))
         _add_splats(scene, "background", background)
         self._layers = [layer_of(template.splats) for template in chronology.templates]
