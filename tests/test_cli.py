@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -311,3 +312,20 @@ def test_the_demo_makes_its_capture_once(pipeline, tmp_path, monkeypatch, capsys
     capsys.readouterr()
     assert main(["demo", "--out", str(tmp_path), "--scene", "light"]) == 2
     assert "another" in _one_line_error(capsys)
+
+
+def test_the_documents_name_commands_and_options_that_exist(pipeline, capsys):
+    root = Path(__file__).parents[1]
+    lines = [
+        line
+        for path in (root / "README.md", *sorted((root / "docs").glob("*.md")))
+        for line in path.read_text().splitlines()
+        if line.startswith("ltgs ")
+    ]
+    assert len(lines) >= 10
+    for line in lines:
+        name = line.split()[1]
+        assert main([name, "--help"]) == 0, line
+        known = capsys.readouterr().out
+        for option in re.findall(r"--[a-z][a-z-]*", line):
+            assert option in known, line
