@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ltgs_jax.geometry import SE3, Camera, quat_from_rotmat, stack_cameras
-from ltgs_jax.render import RenderConfig, RenderPlan, plan_render, render
+from ltgs_jax.render import RenderPlan, plan_render, render
 from ltgs_jax.scene import Chronology, Splats
 
 _SIDE = 144  # pixels
@@ -27,42 +27,53 @@ def up_direction(cameras: list[Camera]) -> Float[np.ndarray, "3"]:
 def turntable(chronology: Chronology, up: Float[np.ndarray, "3"]) -> list[Float[np.ndarray, "views h w 4"]]:
     """Every template from four sides and a little above: colours and alpha in 0..1, by template.
 
-    One program serves all: the templates are padded to one count and share a plan.
+    Templates are brought to one middle, one size and one count of splats, and capacities are rounded up, so that one
+    compiled program serves all of them, and mostly the next run too.
     """
     templates = [template.splats for template in chronology.templates]
     count = max((splats.count for splats in templates), default=0)
     if not count:
         return [np.zeros((len(_AZIMUTHS), _SIDE, _SIDE, 4))] * len(templates)
-    padded = [_padded(splats, count) for splats in templates]
-    rings = [_ring(np.asarray(splats.means, np.float64), up) for splats in templates]
-    # In units of the object's own radius, so that the near plane means the same for all.
-    near = min((radius for _, radius in rings), default=1.0) * 0.1
-    config = RenderConfig(near=near)
-    plans = [plan_render(p, c, config=config, slack=1) for p, (c, _) in zip(padded, rings, strict=True)]
-    plan = RenderPlan(max(p.intersections for p in plans), max(p.rounds for p in plans))
+    alike = [_normalized(splats, _power_of_two(count)) for splats in templates]
+    cameras = _ring(up)
+    plans = [plan_render(splats, cameras, slack=1) for splats in alike]
+    plan = RenderPlan(
+        _power_of_two(max(plan.intersections for plan in plans)), _power_of_two(max(plan.rounds for plan in plans))
+    )
     images = []
-    for splats, (cameras, _) in zip(padded, rings, strict=True):
-        seen = render(splats, cameras, plan=plan, config=config)
+    for splats in alike:
+        seen = render(splats, cameras, plan=plan)
         alpha = np.asarray(seen.alpha)[..., None]
         colors = np.asarray(seen.image) / np.maximum(alpha, 1e-6)
         images.append(np.clip(np.concatenate([colors, alpha], axis=-1), 0, 1))
     return images
 
 
-def _padded(splats: Splats, count: int) -> Splats:
-    """The same with splats of no opacity after it; their degree of SH does not matter."""
+def _power_of_two(least: int) -> int:
+    return 1 << max(0, least - 1).bit_length()
+
+
+def _normalized(splats: Splats, count: int) -> Splats:
+    """The same around the origin, most of it within a radius of 1; then splats of no opacity up to `count`."""
     missing = count - splats.count
-    filled = jax.tree.map(lambda x: jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1)), splats)
-    logits = jnp.where(jnp.arange(count) < splats.count, filled.logit_opacities, -jnp.inf)
-    quats = filled.quats.at[splats.count :, 0].set(1)
-    return Splats(filled.means, quats, filled.log_scales, logits, filled.sh)
-
-
-def _ring(points: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"]) -> tuple[Camera, float]:
-    """Cameras around points, and the radius that they look at."""
+    points = np.asarray(splats.means, np.float64)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     distances = np.linalg.norm(points - middle, axis=1)
     radius = max(float(np.quantile(distances, 0.98)) if len(points) else 1.0, 1e-6)
+    moved = Splats(
+        (splats.means - jnp.asarray(middle, splats.means.dtype)) / radius,
+        splats.quats,
+        splats.log_scales - np.log(radius).astype(splats.log_scales.dtype),
+        splats.logit_opacities,
+        splats.sh,
+    )
+    filled = jax.tree.map(lambda x: jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1)), moved)
+    logits = jnp.where(jnp.arange(count) < splats.count, filled.logit_opacities, -jnp.inf)
+    return Splats(filled.means, filled.quats.at[splats.count :, 0].set(1), filled.log_scales, logits, filled.sh)
+
+
+def _ring(up: Float[np.ndarray, "3"]) -> Camera:
+    """Cameras around the origin that look at it."""
     side = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     side /= np.linalg.norm(side)
     ahead = np.cross(up, side)
@@ -72,10 +83,10 @@ def _ring(points: Float[np.ndarray, "n 3"], up: Float[np.ndarray, "3"]) -> tuple
     for azimuth in _AZIMUTHS:
         outward = np.cos(azimuth) * side + np.sin(azimuth) * ahead
         outward = np.cos(_ELEVATION) * outward + np.sin(_ELEVATION) * up
-        right = np.cross(-up, -outward)
+        right = np.cross(up, outward)
         right /= np.linalg.norm(right)
-        rotmat = np.stack([right, np.cross(-outward, right), -outward])
-        xyz = -rotmat @ (middle + _DISTANCE * radius * outward)
+        rotmat = np.stack([right, np.cross(right, outward), -outward])
+        xyz = -rotmat @ (_DISTANCE * outward)
         pose = SE3(quat_from_rotmat(jnp.asarray(rotmat, jnp.float32)), jnp.asarray(xyz, jnp.float32))
         cameras.append(Camera(pose, K, _SIDE, _SIDE))
-    return stack_cameras(cameras), radius
+    return stack_cameras(cameras)
