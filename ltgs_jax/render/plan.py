@@ -5,22 +5,34 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
-from .binning import Grid, tile_boxes
 from .config import RenderConfig, RenderPlan
+from .grid import Grid, count_boxes, drop_inactive, tile_boxes
 from .project import Projected, project_splats
+from .slots import block_rounds, tiles_per_block
+
+# Plans made so far by the kind of program: reusing one saves a compilation, and the result does not depend on it.
+_made: dict[tuple, set[RenderPlan]] = {}
 
 
-def tiles_per_block(config: RenderConfig, tiles: int) -> int:
-    """Tiles that advance together: few on a CPU, where a block stays in the cache; all on other devices."""
-    wanted = config.tiles_per_block
-    if wanted is None:
-        wanted = 128 if jax.default_backend() == "cpu" else tiles
-    return max(1, min(wanted, tiles))
+def _settle(kind: tuple, pairs: float, rounds: float) -> RenderPlan:
+    """A plan with room for so many pairs and rounds: the smallest made before that fits without waste, or a new one."""
+    plans = _made.setdefault(kind, set())
+    fits = [
+        plan
+        for plan in plans
+        if pairs <= plan.intersections <= 2 * max(pairs, 1024) and rounds <= plan.rounds <= 2 * max(rounds, 16)
+    ]
+    if fits:
+        return min(fits, key=lambda plan: (plan.intersections, plan.rounds))
+    plan = RenderPlan(_round_up(pairs, 1024), _round_up(rounds, 16))
+    plans.add(plan)
+    return plan
 
 
 def batch_of(camera: Camera) -> Camera:
@@ -43,41 +55,38 @@ def _round_up(count: float, least: int) -> int:
     return -(-count // step) * step
 
 
-def block_rounds(counts: Int[Array, " tiles"], block: int, chunk: int) -> tuple[Int[Array, " tiles"], Int[Array, " b"]]:
-    """Tiles by decreasing count, padded to whole blocks (with index `tiles`), and the rounds of each block."""
-    tiles = counts.shape[0]
-    padding = -tiles % block
-    with jax.enable_x64(True):
-        inverse = jnp.uint64(0xFFFFFFFF) - counts.astype(jnp.uint64)
-        packed = jnp.sort((inverse << jnp.uint64(32)) | jnp.arange(tiles, dtype=jnp.uint64))
-        order = (packed & jnp.uint64(0xFFFFFFFF)).astype(jnp.int32)
-    order = jnp.concatenate([order, jnp.full(padding, tiles, jnp.int32)])
-    return order, -(-counts[order[::block]] // chunk)
-
-
 @functools.partial(jax.jit, static_argnames=("config",))
-def _count(splats: Splats, cameras: Camera, *, config: RenderConfig) -> tuple[Float[Array, ""], Int[Array, ""]]:
+def _count(splats: Splats, cameras: Camera, tiles, *, config: RenderConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Pairs of splat and tile by bounding box, and the rounds that they need: upper bounds of what rendering finds."""
     projected = jax.lax.stop_gradient(project_batch(splats, cameras, near=config.near))
     grid = Grid(cameras.width, cameras.height, config.tile_size, cameras.K.shape[0])
     boxes = tile_boxes(projected, grid)
-    pairs = (boxes[:, 2] - boxes[:, 0]).astype(jnp.float32) * (boxes[:, 3] - boxes[:, 1]).astype(jnp.float32)
-    camera = jnp.repeat(jnp.arange(grid.cameras, dtype=jnp.int32), splats.count)
-    # A box adds one to the tiles it covers: four corners, then sums along both axes.
-    corners = jnp.zeros((grid.cameras, grid.rows + 1, grid.columns + 1), jnp.int32)
-    for row, column, sign in ((1, 0, 1), (1, 2, -1), (3, 0, -1), (3, 2, 1)):
-        corners = corners.at[camera, boxes[:, row], boxes[:, column]].add(sign)
-    counts = jnp.cumsum(jnp.cumsum(corners, axis=1), axis=2)[:, :-1, :-1].reshape(-1)
-    _, rounds = block_rounds(counts, tiles_per_block(config, grid.count), config.chunk)
-    return jnp.sum(pairs), jnp.sum(rounds)
+    chosen = None
+    if tiles is not None:
+        chosen, active = grid.choose(tiles)
+        boxes = drop_inactive(boxes, grid, active)
+    counts = count_boxes(boxes, grid)
+    if chosen is not None:
+        counts = jnp.where(chosen >= 0, counts[chosen], 0)
+    _, rounds = block_rounds(counts, tiles_per_block(config, counts.shape[0]), config.chunk)
+    with jax.enable_x64(True):
+        pairs = jnp.sum((boxes[:, 2] - boxes[:, 0]).astype(jnp.int64) * (boxes[:, 3] - boxes[:, 1]).astype(jnp.int64))
+    return pairs, jnp.sum(rounds)
 
 
 def plan_render(
-    splats: Splats, camera: Camera, *, config: RenderConfig | None = None, slack: float = 1.3
+    splats: Splats,
+    camera: Camera,
+    *,
+    tiles: Int[Array, "*c t"] | None = None,
+    config: RenderConfig | None = None,
+    slack: float = 1.3,
 ) -> RenderPlan:
-    """Static capacities for `render` of these splats by this camera, or by each of a batch at once.
+    """Static capacities for `render` of these splats by this camera, or by all of a batch at once.
 
-    `slack` is the factor of room for splats that move or grow before the next plan. Not for use under jit.
+    Counts bounding boxes, which bounds the exact tests of `render` from above: with `slack` 1 the plan holds for these
+    splats and this camera. `slack` is the factor of room for splats that move or grow before the next plan; `tiles` as
+    for `render`. Not for use under jit.
 
     Raises ValueError when `slack` is below 1, when a camera holds a number that is not finite, or under a
     transformation that hides the values.
@@ -85,14 +94,15 @@ def plan_render(
     config = config or RenderConfig()
     if slack < 1:
         raise ValueError(f"slack: expected at least 1, got {slack}")
-    leaves = jax.tree.leaves((splats, camera))
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((splats, camera, tiles))):
         raise ValueError("plan: expected a RenderPlan under jit or another transformation; make one with plan_render")
     cameras = batch_of(camera)
     for leaf in jax.tree.leaves(cameras):
-        if not bool(jnp.all(jnp.isfinite(leaf))):
+        if not np.all(np.isfinite(leaf)):
             raise ValueError("camera: expected finite poses and intrinsics, got NaN or infinity")
     if splats.count == 0:
-        return RenderPlan(intersections=1024, rounds=1)
-    pairs, rounds = _count(splats, cameras, config=config)
-    return RenderPlan(_round_up(float(pairs) * slack, 1024), _round_up(int(rounds) * slack, 16))
+        return RenderPlan(intersections=1024, rounds=16)
+    kind = (splats.count, cameras.K.shape[0], cameras.width, cameras.height, config, tiles is None or tiles.shape)
+    batch_tiles = tiles if tiles is None or camera.K.ndim == 3 else tiles[None]
+    pairs, rounds = _count(splats, cameras, batch_tiles, config=config)
+    return _settle(kind, int(pairs) * slack, int(rounds) * slack)

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt32
 
 from ltgs_jax.geometry import Camera, eval_sh, rotmat_from_quat
 from ltgs_jax.scene import Splats
@@ -20,14 +20,18 @@ class Projected(eqx.Module):
     `means2d` pixels; the exponent at offset (dx, dy) is ½[(dx·inverse_a)² + ((dy − slope·dx)·inverse_b)²], the LDL form
     of fact 1 in the conventions; `extents` half sizes in pixels of the box outside of which α < 1/255; `reach` the
     exponent at which α = 1/255; `visible` false for culled splats, whose other fields are finite and meaningless.
+    `remainders` is what float32 `means2d` lack of their value in float64, and `depth_words` are the high and low bits
+    of float64 depths, whose order is theirs: rounding of either in float32 would show in the image.
     """
 
     means2d: Float[Array, "n 2"]
+    remainders: Float[Array, "n 2"]
     inverse_a: Float[Array, " n"]
     slope: Float[Array, " n"]
     inverse_b: Float[Array, " n"]
     opacities: Float[Array, " n"]
     depths: Float[Array, " n"]
+    depth_words: UInt32[Array, "n 2"]
     colors: Float[Array, "n ch"]
     extents: Float[Array, "n 2"]
     reach: Float[Array, " n"]
@@ -44,9 +48,31 @@ def _choose(mask: Bool[Array, " n"], x: Float[Array, "n ..."], other: float) -> 
     return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, jnp.asarray(other, x.dtype))
 
 
+def _columns(x: Float[Array, "n d"]) -> list[Float[Array, " n"]]:
+    """Columns by splitting: the transpose of a split is one concatenation, of an index a padded array per column."""
+    return [column[:, 0] for column in jnp.split(x, x.shape[1], axis=1)]
+
+
 def _times(matrix, vectors: list) -> list:
     """Elementwise 3×3 by list of three arrays: exact products on every device, and no tiny batched matmul."""
     return [matrix[i][0] * vectors[0] + matrix[i][1] * vectors[1] + matrix[i][2] * vectors[2] for i in range(3)]
+
+
+def _refine(means, camera: Camera, means2d) -> tuple[Float[Array, "n 2"], UInt32[Array, "n 2"]]:
+    """`remainders` and `depth_words` of `Projected`, with the projection of the means repeated in float64."""
+    means, camera, means2d = jax.lax.stop_gradient((means, camera, means2d))
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda x: x.astype(jnp.float64), camera)
+        pose, K = exact.cam_from_world, exact.K
+        local = _times(pose.rotmat(), _columns(means.astype(jnp.float64)))
+        x, y, z = (v + pose.xyz[i] for i, v in enumerate(local))
+        z = jnp.where(z > 0, z, 1)
+        pixels = jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2]], axis=-1)
+        remainders = (pixels - means2d.astype(jnp.float64)).astype(means2d.dtype)
+        # Positive floats order as their bits do.
+        bits = jax.lax.bitcast_convert_type(z, jnp.uint64)
+        words = [(bits >> jnp.uint64(32)).astype(jnp.uint32), (bits & jnp.uint64(0xFFFFFFFF)).astype(jnp.uint32)]
+    return remainders, jnp.stack(words, axis=-1)
 
 
 def project_splats(
@@ -72,20 +98,23 @@ def project_splats(
     values = _choose(usable, values, 0)
 
     rotmat = camera.cam_from_world.rotmat()
-    local = [x + camera.cam_from_world.xyz[i] for i, x in enumerate(_times(rotmat, [means[:, i] for i in range(3)]))]
+    local = [x + camera.cam_from_world.xyz[i] for i, x in enumerate(_times(rotmat, _columns(means)))]
     in_front = usable & (local[2] >= near) & _bounded(jnp.stack(local, axis=-1))
     x, y, z = (jnp.where(in_front, v, fill) for v, fill in zip(local, (0, 0, 1), strict=True))
 
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     means2d = jnp.stack([fx * (x / z) + cx, fy * (y / z) + cy], axis=-1)
 
+    remainders, depth_words = _refine(means, camera, means2d)
+    remainders = jnp.where(in_front[:, None] & (jnp.abs(remainders) < 1), remainders, 0)
+
     # 3DGS freezes the affine approximation outside of 1.3 times the field of view.
     margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
     tan_x = jnp.clip(x / z, -cx / fx - margin_x, (camera.width - cx) / fx + margin_x)
     tan_y = jnp.clip(y / z, -cy / fy - margin_y, (camera.height - cy) / fy + margin_y)
-    axes = rotmat_from_quat(quats)
+    axes, sizes = _columns(rotmat_from_quat(quats).reshape(-1, 9)), _columns(scales)
     # M = J·W·R·S, row by row (2×3); its minors give the determinant without cancellation.
-    turned = [_times(rotmat, [axes[:, i, j] * scales[:, j] for i in range(3)]) for j in range(3)]
+    turned = [_times(rotmat, [axes[3 * i + j] * sizes[j] for i in range(3)]) for j in range(3)]
     row_x = [fx / z * (turned[j][0] - tan_x * turned[j][2]) for j in range(3)]
     row_y = [fy / z * (turned[j][1] - tan_y * turned[j][2]) for j in range(3)]
     fits = jnp.abs(jnp.stack(row_x + row_y)).max(axis=0) <= _LARGEST
@@ -116,11 +145,13 @@ def project_splats(
     extents = jnp.sqrt(2 * reach)[:, None] * jnp.sqrt(jnp.stack([a, c], axis=-1))
     return Projected(
         means2d=means2d,
+        remainders=remainders,
         inverse_a=inverse_a,
         slope=slope,
         inverse_b=inverse_b,
         opacities=opacities,
         depths=z,
+        depth_words=depth_words,
         colors=values,
         extents=jax.lax.stop_gradient(extents),
         reach=jax.lax.stop_gradient(reach),

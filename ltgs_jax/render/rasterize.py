@@ -9,45 +9,12 @@ from jaxtyping import Array, Float, Int
 from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
-from .binning import Bins, Grid, bin_splats
-from .composite import Lists, Schedule, composite
+from .binning import bin_splats
+from .composite import Schedule, composite
 from .config import RenderConfig, RenderOutput, RenderPlan
-from .plan import batch_of, block_rounds, plan_render, project_batch, tiles_per_block
-from .project import Projected
-
-
-def _table(projected: Projected) -> Float[Array, "m f"]:
-    """One row per splat: six shape columns, colours, depth."""
-    shape = [projected.inverse_a, projected.slope, projected.inverse_b, projected.opacities]
-    columns = [projected.means2d, jnp.stack(shape, axis=-1), projected.colors, projected.depths[:, None]]
-    return jnp.concatenate(columns, axis=-1)
-
-
-def _lists(bins: Bins, grid: Grid, tiles: Int[Array, " t"] | None, schedule: Schedule, dtype):
-    """Tiles in blocks of similar length; their order; the pairs dropped for lack of rounds."""
-    chosen = jnp.arange(grid.count, dtype=jnp.int32) if tiles is None else tiles
-    known = (chosen >= 0) & (chosen < grid.count)
-    counts = jnp.where(known, bins.counts[jnp.where(known, chosen, 0)], 0)
-    order, rounds = block_rounds(counts, schedule.tiles_per_block, schedule.chunk)
-    offsets = jnp.minimum(jnp.cumsum(rounds) - rounds, schedule.rounds)
-    limits = jnp.minimum(rounds, schedule.rounds - offsets)
-
-    def blocked(values, fill):
-        padded = jnp.concatenate([values, jnp.full((1, *values.shape[1:]), fill, values.dtype)])
-        return padded[order].reshape(-1, schedule.tiles_per_block, *values.shape[1:])
-
-    counts = blocked(counts, 0)
-    dropped = jnp.sum(jnp.maximum(counts - limits[:, None] * schedule.chunk, 0))
-    tile = jnp.where(known, chosen, 0)
-    lists = Lists(
-        splats=bins.splats,
-        starts=blocked(bins.starts[tile], 0),
-        counts=counts,
-        origins=blocked(grid.origins()[tile % grid.per_camera].astype(dtype), 0),
-        offsets=offsets,
-        limits=limits,
-    )
-    return lists, order[: chosen.shape[0]], dropped
+from .grid import Grid
+from .plan import batch_of, plan_render, project_batch
+from .slots import lay_out, make_forms, make_table, tiles_per_block
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "config"))
@@ -55,12 +22,7 @@ def _render_planned(splats, cameras, background, tiles, colors, *, plan: RenderP
     """The whole program for a batch of cameras: every field with leading axes cameras, then tiles or rows."""
     dtype = splats.means.dtype
     grid = Grid(cameras.width, cameras.height, config.tile_size, cameras.K.shape[0])
-    chosen = active = None
-    if tiles is not None:
-        first = jnp.arange(grid.cameras, dtype=jnp.int32)[:, None] * grid.per_camera
-        inside = (tiles >= 0) & (tiles < grid.per_camera)
-        chosen = jnp.where(inside, tiles + first, -1).reshape(-1)
-        active = jnp.zeros(grid.count, jnp.int32).at[jnp.where(chosen < 0, grid.count, chosen)].set(1, mode="drop")
+    chosen, active = (None, None) if tiles is None else grid.choose(tiles)
     schedule = Schedule(
         tile_size=config.tile_size,
         chunk=config.chunk,
@@ -69,27 +31,25 @@ def _render_planned(splats, cameras, background, tiles, colors, *, plan: RenderP
     )
     projected = project_batch(splats, cameras, near=config.near, colors=colors)
     bins = bin_splats(projected, grid, plan.intersections, active)
-    lists, order, dropped = _lists(bins, grid, chosen, schedule, dtype)
-    # A row for an empty scene keeps the gathers legal.
-    table = jnp.pad(_table(projected), ((0, 1), (0, 0)))
-    total, transmittance = composite(schedule, table, lists)
+    slots = lay_out(bins, grid, chosen, schedule, projected.depths.shape[0], dtype)
+    totals, transmittance = composite(schedule, make_forms(make_table(projected), slots), slots.blocks)
 
     def unblocked(values):
-        values = values.reshape(-1, *values.shape[2:])[: order.shape[0]]
-        return jnp.zeros_like(values).at[order].set(values, unique_indices=True)
+        values = values.reshape(-1, values.shape[-1])[: slots.order.shape[0]]
+        values = jnp.zeros_like(values).at[slots.order].set(values, unique_indices=True)
+        return values.reshape(grid.cameras, -1, config.tile_size, config.tile_size)
 
-    side = config.tile_size
-    total = jnp.moveaxis(unblocked(total), 1, 2).reshape(grid.cameras, -1, side, side, table.shape[1] - 6)
-    transmittance = unblocked(transmittance).reshape(grid.cameras, -1, side, side)
-    image = total[..., :-1]
+    *totals, total_depth = (unblocked(total) for total in totals)
+    transmittance = unblocked(transmittance)
+    image = jnp.stack(totals, axis=-1)
     if background is not None:
         image = image + transmittance[..., None] * background.astype(dtype)
     alpha = 1 - transmittance
     covered = alpha > 0
-    depth = jnp.where(covered, total[..., -1] / jnp.where(covered, alpha, 1), 0)
+    depth = jnp.where(covered, total_depth / jnp.where(covered, alpha, 1), 0)
     if tiles is None:
         image, alpha, depth = (_untile(v, grid) for v in (image, alpha, depth))
-    return RenderOutput(image, alpha, depth, bins.overflow + dropped.astype(jnp.int32))
+    return RenderOutput(image, alpha, depth, bins.overflow + slots.dropped)
 
 
 def _untile(values: Float[Array, "c t s s *ch"], grid: Grid) -> Float[Array, "c h w *ch"]:
@@ -119,8 +79,8 @@ def render(
     images; indices outside of the grid (say −1) are padding and give background. `camera` must not be batched deeper
     than once.
 
-    Without a `plan`, one is made from a counting pass and made larger until nothing overflows; under jit and other
-    transformations that hide values a plan is required, and the caller watches `overflow`.
+    Without a `plan`, one is made by a counting pass whose bound holds for these very splats, so that nothing overflows;
+    under jit and other transformations that hide values a plan is required, and the caller watches `overflow`.
 
     Differentiable in splats, camera, background and colours, in reverse and in forward mode; not where a splat crosses
     α = 1/255, α = 0.99, transmittance 1e-4 or the near plane, nor in the order of depths.
@@ -132,10 +92,8 @@ def render(
     cameras = batch_of(camera)
     batch_tiles = tiles if tiles is None or camera.K.ndim == 3 else tiles[None]
     if plan is None:
-        plan = plan_render(*jax.lax.stop_gradient((splats, camera)), config=config, slack=1)
-        output = _render_planned(splats, cameras, background, batch_tiles, colors, plan=plan, config=config)
-    else:
-        output = _render_planned(splats, cameras, background, batch_tiles, colors, plan=plan, config=config)
+        plan = plan_render(*jax.lax.stop_gradient((splats, camera)), tiles=tiles, config=config, slack=1)
+    output = _render_planned(splats, cameras, background, batch_tiles, colors, plan=plan, config=config)
     if camera.K.ndim == 3:
         return output
     return RenderOutput(output.image[0], output.alpha[0], output.depth[0], output.overflow)
