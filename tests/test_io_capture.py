@@ -339,6 +339,25 @@ def test_hostile_image_sizes_are_not_believed(tmp_path):
     assert name == "IMG_0001/001.png" and "15000×15000" in reason
 
 
+def test_two_names_for_one_result(tmp_path):
+    """renders/<visit>/<name>.png could not hold both."""
+    make_capture(tmp_path)
+    io.write_image(tmp_path / "images" / "IMG_0001" / "001.jpg", noise())
+    with pytest.raises(io.InputError, match=r"001\.png: IMG_0001/001\.jpg has the same name"):
+        io.read_capture(tmp_path)
+
+
+def test_exif_focal_length_in_pixels(tmp_path):
+    make_capture(tmp_path, suffix=".jpg")
+    path = tmp_path / "images" / "IMG_0001" / "001.jpg"
+    spec = oiio.ImageSpec(32, 24, 3, "uint8")
+    spec.attribute("Exif:FocalLengthIn35mmFilm", 27)
+    output = oiio.ImageOutput.create(str(path))
+    assert output.open(str(path), spec) and output.write_image(np.zeros((24, 32, 3), np.uint8)) and output.close()
+    focal = {p.name: p.exif_focal for p in io.read_capture(tmp_path).photographs}
+    assert focal["IMG_0001/001.jpg"] == pytest.approx(24) and focal["IMG_0001/000.jpg"] is None
+
+
 def test_phone_data_behind_the_end_of_a_jpeg_is_fine(tmp_path):
     make_capture(tmp_path, suffix=".jpg")
     path = tmp_path / "images" / "IMG_0001" / "001.jpg"

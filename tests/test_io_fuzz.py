@@ -209,4 +209,4 @@ def test_damaged_photographs(tmp_path):
 def test_damaged_files_many_ways(tmp_path, kind):
     if kind == "spz-4":
         pytest.importorskip("zstandard")
-    _in_a_process([kind], tmp_path, 1500)
+    _in_a_process([kind], tmp_path, 1000)

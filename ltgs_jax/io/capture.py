@@ -115,12 +115,16 @@ def _headers(layout: Layout, problems: list[tuple[str, str]]) -> dict[str, Image
     """Headers of all readable photographs; the others become problems, a visit without any an error."""
     headers = {}
     for visit, files in zip(layout.visits, layout.photographs, strict=True):
-        reasons = []
+        reasons: list[tuple[str, str]] = []
+        stems: dict[str, str] = {}
         for name, path in files:
             try:
                 headers[name] = read_header(path)
             except InputError as error:
                 reasons.append((name, str(error)))
+            stem = name.rsplit(".", 1)[0]
+            if name in headers and stems.setdefault(stem, name) != name:
+                raise InputError(f"{path}: {stems[stem]} has the same name but for its suffix; rename one of them")
         if len(reasons) == len(files):
             raise InputError(f"visit {visit}: none of its photographs can be read; the first: {reasons[0][1]}")
         problems += reasons
@@ -218,6 +222,7 @@ def _photograph(
         lens_given=lens is not None,
         has_alpha=header.channels in (2, 4),
         oriented=False,
+        exif_focal=header.focal,
     )
 
 

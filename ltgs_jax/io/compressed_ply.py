@@ -62,7 +62,8 @@ def splats_of_chunks(tables: dict[str, np.ndarray], path: str | Path) -> Splats:
 
     color = vertices["packed_color"].astype(np.uint32)
     rgb = np.stack([(color >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32) / 255
-    if "min_r" in names and "max_b" in names:
+    # The format's first version has no bounds of colours.
+    if all(f"{end}_{axis}" in names for axis in _BOUNDS[6:] for end in ("min", "max")):
         rgb = within(rgb, _BOUNDS[6:])
     sh = np.concatenate([sh_of_color(rgb)[:, None], _higher_sh(tables.get("sh"), n, path)], axis=1)
     return checked_splats(

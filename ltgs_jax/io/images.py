@@ -18,12 +18,13 @@ _MOST_PIXELS_PER_BYTE = 4000  # an empty mask as PNG reaches 1000; beyond this t
 
 @dataclasses.dataclass(frozen=True)
 class ImageHeader:
-    """Stored size in pixels, channels, and the EXIF orientation (1 = as stored)."""
+    """Stored size in pixels, channels, the EXIF orientation (1 = as stored), and the focal length in pixels by EXIF."""
 
     width: int
     height: int
     channels: int
     orientation: int
+    focal: float | None
 
 
 def read_header(path: Path) -> ImageHeader:
@@ -48,7 +49,10 @@ def read_header(path: Path) -> ImageHeader:
         raise InputError(f"{path}: its header claims {width}×{height} pixels in {size} bytes")
     if _is_cut_short(path):
         raise InputError(f"{path}: is cut short")
-    return ImageHeader(width, height, spec.nchannels, spec.get_int_attribute("Orientation", 1))
+    # Equivalent focal lengths refer to film 36 mm wide.
+    equivalent = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
+    focal = equivalent / 36 * max(width, height) if 5 <= equivalent <= 1000 else None
+    return ImageHeader(width, height, spec.nchannels, spec.get_int_attribute("Orientation", 1), focal)
 
 
 def _last_error() -> str:

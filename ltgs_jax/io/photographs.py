@@ -34,7 +34,8 @@ class Photograph:
     `camera_model` the lens, `lens_given` whether a file says so (else it is that of the other photographs of this
     size; None when there is none). `role`: `train` or `test` at the first visit; `update`, `test`, or `unused` (in
     neither list) later. `width`, `height` in pixels, of the photograph as it is used. `oriented`: the EXIF
-    orientation is applied, because only then the size agrees with the camera's.
+    orientation is applied, because only then the size agrees with the camera's. `exif_focal` in pixels, where the
+    photograph's EXIF gives an equivalent focal length.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Photograph:
     lens_given: bool
     has_alpha: bool
     oriented: bool
+    exif_focal: float | None = None
 
 
 def load_image(photograph: Photograph, *, max_side: int | None = None) -> Float[np.ndarray, "h w 3"]:
