@@ -66,7 +66,7 @@ def read_splat(path: str | Path) -> Splats:
     table = np.frombuffer(content, _RECORD)
     if np.any(table["scale"] < 0):
         raise InputError(f"{path}: is not a .splat file: it has negative scales")
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):
         log_scales = np.log(table["scale"])
     return checked_splats(
         means=table["mean"].copy(),
