@@ -166,3 +166,14 @@ def test_text_faults_are_named(tmp_path, name, text, message):
     with pytest.raises(io.InputError, match=message) as caught:
         io.read_colmap(tmp_path)
     assert f"{name}.txt" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_identifiers_beyond_any_model_are_no_points(tmp_path):
+    io.write_colmap(tmp_path, make_model())
+    path = tmp_path / "images.txt"
+    path.write_text(path.read_text().replace(" 20\n", " 99999999999999999999\n").replace(" -1\n", " 1e300\n"))
+    assert all(np.all(image.point_ids < 28) for image in io.read_colmap(tmp_path).images.values())
+    path = tmp_path / "points3D.txt"
+    path.write_text(path.read_text() + "99999999999999999999 1 2 3 4 5 6 0 1e300 1e300\n")
+    read = io.read_colmap(tmp_path)
+    assert len(read.points) == 9 and read.point_ids[-1] == -1 and not np.any(read.track[:, 0] == 8)

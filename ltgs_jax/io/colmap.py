@@ -190,6 +190,11 @@ def _numbers(path: Path, number: int, tokens: list[str]) -> np.ndarray:
         raise InputError(f"{path}: line {number}: expected numbers, got {' '.join(tokens)[:60]!r}") from None
 
 
+def _integers(values: np.ndarray) -> np.ndarray:
+    """Identifiers read as floats; what none can be becomes −1, as COLMAP marks keypoints without a point."""
+    return np.where(np.abs(values) < 2**53, values, -1).astype(np.int64)
+
+
 def _text_cameras(path: Path) -> dict[int, CameraModel]:
     cameras = {}
     for number, line in _lines(path):
@@ -240,8 +245,8 @@ def _text_images(path: Path) -> dict[int, ColmapImage]:
         if len(table) % 3:
             raise InputError(f"{path}: line {number + 1}: expected keypoints as x, y, point; got {len(table)} values")
         table = table.reshape(-1, 3)
-        identity, camera_id = (int(value) if np.isfinite(value) else -1 for value in values[[0, 8]])
-        point_ids = np.nan_to_num(table[:, 2], nan=-1, posinf=-1, neginf=-1).astype(np.int64)
+        identity, camera_id = _integers(values[[0, 8]]).tolist()
+        point_ids = _integers(table[:, 2])
         images[identity] = ColmapImage(tokens[9], camera_id, values[1:5], values[5:8], table[:, :2], point_ids)
     return images
 
@@ -254,7 +259,7 @@ def _text_points(path: Path) -> tuple[list, list, list]:
         values = _numbers(path, number, line.split())
         if len(values) < 7 or len(values) not in (7, *range(8, len(values) + 1, 2)) or not np.isfinite(values).all():
             raise InputError(f"{path}: line {number}: expected id, x y z, r g b, error, track; got {line[:60]!r}")
-        ids.append(int(values[0]))
+        ids.append(int(_integers(values[:1])[0]))
         rows.append([*values[1:7], values[7] if len(values) > 7 else 0.0])
-        tracks.append(values[8:].astype(np.int64).reshape(-1, 2))
+        tracks.append(_integers(values[8:]).reshape(-1, 2))
     return ids, rows, tracks

@@ -38,6 +38,9 @@ def read_header(path: Path) -> ImageHeader:
         raise InputError(f"{path}: no such photograph")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: is empty")
+    # Before the decoder sees it: libpng complains on stderr of its own accord.
+    if _is_cut_short(path):
+        raise InputError(f"{path}: is cut short")
     image = oiio.ImageInput.open(str(path))
     if image is None:
         raise InputError(f"{path}: is not an image that can be read ({_last_error()})")
@@ -47,8 +50,6 @@ def read_header(path: Path) -> ImageHeader:
     size = path.stat().st_size
     if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, _MOST_PIXELS_PER_BYTE * size)):
         raise InputError(f"{path}: its header claims {width}×{height} pixels in {size} bytes")
-    if _is_cut_short(path):
-        raise InputError(f"{path}: is cut short")
     # Equivalent focal lengths refer to film 36 mm wide.
     equivalent = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
     focal = equivalent / 36 * max(width, height) if 5 <= equivalent <= 1000 else None
