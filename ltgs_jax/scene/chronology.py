@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
 
@@ -51,16 +51,16 @@ class Chronology(eqx.Module):
         )
 
 
-def compose(chronology: Chronology, t: int) -> Splats:
+def compose(chronology: Chronology, t: int | Int[Array, ""]) -> Splats:
     """The scene at visit `t`: background, then every template moved to its pose, hidden where it is not visible.
 
     Equation 1 of the LTGS paper and its opacity filter. Hidden templates keep their place in the arrays with opacity 0,
-    so that the shapes do not depend on `t`; `drop_hidden` leaves them out.
+    so that the shapes do not depend on `t`, which may be traced; `drop_hidden` leaves them out.
 
     Raises ValueError when `t` is not a visit.
     """
     visits = chronology.visible.shape[0]
-    if not 0 <= t < visits:
+    if isinstance(t, int) and not 0 <= t < visits:
         raise ValueError(f"t: expected a visit from 0 to {visits - 1}, got {t}")
     parts = [chronology.background]
     for k, template in enumerate(chronology.templates):

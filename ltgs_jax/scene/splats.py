@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
@@ -43,13 +44,18 @@ class Splats(eqx.Module):
 
 
 def concatenate_splats(parts: list[Splats]) -> Splats:
-    """Splats one after the other; lower SH degrees are padded with zeros to the highest."""
+    """Splats one after the other; lower SH degrees are padded with zeros to the highest.
+
+    Splats of NumPy arrays stay on the host, where a new shape costs no compilation.
+    """
+    on_host = all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(parts))
+    xp = np if on_host else jnp
     k = max(part.sh.shape[1] for part in parts)
     padded = [
-        eqx.tree_at(lambda s: s.sh, part, jnp.pad(part.sh, ((0, 0), (0, k - part.sh.shape[1]), (0, 0))))
+        eqx.tree_at(lambda s: s.sh, part, xp.pad(part.sh, ((0, 0), (0, k - part.sh.shape[1]), (0, 0))))
         for part in parts
     ]
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *padded)
+    return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *padded)
 
 
 def transform_splats(b_from_a: SE3, splats: Splats) -> Splats:

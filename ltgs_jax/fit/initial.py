@@ -1,0 +1,165 @@
+"""The initial scene, fitted to the first visit's photographs from the points of structure from motion."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.spatial import cKDTree
+
+from ltgs_jax.geometry import C0, Camera
+from ltgs_jax.render import RenderPlan, render, splat_votes
+from ltgs_jax.scene import Splats
+
+from .growth import faint, recycle
+from .loss import photometric_loss
+from .optimizer import Rates, adam, reset_moments, scale_gradients
+from .views import View, half_size, plan_for, scene_extent, size_of
+
+
+@dataclass(frozen=True)
+class InitialConfig:
+    """How the initial scene is fitted."""
+
+    steps: int = 800
+    max_splats: int = 30_000
+    sh_degree: int = 1
+    dssim: float = 0.2
+    """λ, the weight of 1 − SSIM in the loss."""
+    coarse_fraction: float = 0.3
+    """Share of the steps at half resolution."""
+    grow_until: float = 0.7
+    """Share of the steps after which no splat is split any more."""
+    grow_every: int = 100
+    opacity_penalty: float = 0.005
+    """Weight of the mean opacity: what no photograph needs fades and is recycled."""
+    rates: Rates = field(default_factory=Rates)
+
+
+class FitResult(eqx.Module):
+    """Splats and the trace of the loss."""
+
+    splats: Splats
+    losses: np.ndarray
+
+
+def splats_from_points(
+    points: np.ndarray, colors: np.ndarray, *, capacity: int, sh_degree: int, opacity: float = 0.1
+) -> Splats:
+    """Splats at points [m 3] with colours [m 3] in 0…1, padded to `capacity` with invisible ones.
+
+    Scale: the mean distance to the three nearest neighbours; identity rotation (section 3 of 3DGS).
+    Raises ValueError with fewer than four points.
+    """
+    if len(points) < 4:
+        raise ValueError(f"points: expected at least 4 to start the initial scene, got {len(points)}")
+    if len(points) > capacity:
+        keep = np.random.default_rng(0).choice(len(points), capacity, replace=False)
+        points, colors = points[keep], colors[keep]
+    distances, _ = cKDTree(points).query(points, k=4)
+    spacing = np.sqrt(np.mean(distances[:, 1:] ** 2, axis=1))
+    spacing = np.clip(spacing, 1e-4 * np.median(spacing) + 1e-12, np.quantile(spacing, 0.99))
+    count, padding = len(points), capacity - len(points)
+    sh = np.zeros((capacity, (sh_degree + 1) ** 2, 3), np.float32)
+    sh[:count, 0] = (colors - 0.5) / C0
+    quats = np.zeros((capacity, 4), np.float32)
+    quats[:, 0] = 1
+    logit = np.log(opacity / (1 - opacity))
+    return Splats(
+        means=jnp.asarray(np.pad(points, ((0, padding), (0, 0))), jnp.float32),
+        quats=jnp.asarray(quats),
+        log_scales=jnp.asarray(np.pad(np.repeat(np.log(spacing)[:, None], 3, 1), ((0, padding), (0, 0))), jnp.float32),
+        logit_opacities=jnp.asarray(np.r_[np.full(count, logit), np.full(padding, -20.0)], jnp.float32),
+        sh=jnp.asarray(sh),
+    )
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _step(inputs, splats: Splats, state, config: InitialConfig, plan: RenderPlan):
+    """One Adam step on one photograph. `inputs`: camera, image, mask, extent, progress."""
+    camera, image, mask, extent, progress = inputs
+    target = image.astype(splats.means.dtype) / 255
+
+    def objective(splats):
+        out = render(splats, camera, plan=plan)
+        loss = photometric_loss(out.image, target, mask, dssim=config.dssim)
+        return loss + config.opacity_penalty * jnp.mean(splats.opacities), (loss, out.overflow)
+
+    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(splats)
+    updates, state = adam().update(gradient, state)
+    steps = scale_gradients(updates, config.rates, extent, progress)
+    return eqx.apply_updates(splats, steps), state, loss, overflow
+
+
+@eqx.filter_jit
+def _error_votes(splats: Splats, camera: Camera, image, mask, plan: RenderPlan) -> Float[Array, "n 1"]:
+    """Per splat Σ αT·|residual| over the pixels that count."""
+    out = render(splats, camera, plan=plan)
+    residual = jnp.mean(jnp.abs(out.image - image.astype(out.image.dtype) / 255), axis=-1)
+    return splat_votes(splats, camera, (residual * mask)[..., None], plan=plan)
+
+
+def _error_scores(splats: Splats, views: Sequence[View], plans: dict) -> Float[Array, " n"]:
+    """Error mass of each splat over some views."""
+    return sum(_error_votes(splats, v.camera, v.image, v.mask, plans[size_of(v)]) for v in views)[:, 0]
+
+
+def _plans(splats: Splats, views: Sequence[View]) -> dict[tuple[int, int], RenderPlan]:
+    """One plan per image size."""
+    sizes = sorted({size_of(view) for view in views})
+    # Roomy, since every new plan is a new compilation: splats shrink while they are fitted, but their number grows.
+    return {size: plan_for([(splats, v.camera) for v in views if size_of(v) == size], slack=1.6) for size in sizes}
+
+
+def fit_initial(
+    splats: Splats,
+    views: Sequence[View],
+    *,
+    key: Array,
+    config: InitialConfig = InitialConfig(),
+    progress: Callable[[int, int, str], None] = lambda i, n, text: None,
+) -> FitResult:
+    """Fit `splats` (faint ones are free slots) to photographs: L1 + D-SSIM, Adam, growth at fixed capacity.
+
+    `views` may differ in size. `progress(step, steps, text)` is called now and then. Raises ValueError without a view.
+    """
+    if not views:
+        raise ValueError("views: expected at least one photograph to fit, got none")
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+    extent = jnp.asarray(scene_extent([view.camera for view in views]), splats.means.dtype)
+    coarse_steps = int(config.coarse_fraction * config.steps)
+    grow_until = int(config.grow_until * config.steps)
+    rounds = max(1, grow_until // config.grow_every)
+    alive = int(jnp.sum(~faint(splats)))
+    growth = (splats.count / max(alive, 1)) ** (1 / rounds) * 1.1
+    splats = jax.tree.map(jnp.copy, splats)  # the steps donate their buffers, and the caller's are not ours
+    state = adam().init(splats)
+    losses = np.zeros(config.steps, np.float32)
+    current, plans, order = [half_size(view) for view in views], {}, []
+    if coarse_steps == 0:
+        current = list(views)
+    for step in range(config.steps):
+        if step == coarse_steps:
+            current, plans = list(views), {}
+        if not plans:
+            plans = _plans(splats, current)
+        if step % config.grow_every == 0 and 0 < step <= grow_until:
+            sample = [current[i] for i in rng.permutation(len(views))[:8]]
+            scores = _error_scores(splats, sample, plans)
+            splats, replaced = recycle(splats, scores, jnp.asarray(int((growth - 1) * alive) + 1))
+            state = reset_moments(state, replaced)
+            alive = int(jnp.sum(~faint(splats)))
+        order = order or rng.permutation(len(views)).tolist()
+        view = current[order.pop()]
+        inputs = (view.camera, view.image, view.mask, extent, jnp.asarray(step / config.steps, splats.means.dtype))
+        splats, state, loss, overflow = _step(inputs, splats, state, config, plans[size_of(view)])
+        losses[step] = loss
+        if int(overflow) > 0:
+            plans = _plans(splats, current)
+        if step % 50 == 0 or step == config.steps - 1:
+            mean = losses[max(0, step - len(views)) : step + 1].mean()
+            progress(step + 1, config.steps, f"loss {mean:.4f}, {alive} splats")
+    return FitResult(splats[~faint(splats)], losses)

@@ -1,0 +1,175 @@
+"""Growth at fixed capacity, the initial fit, the long fit, the local fit."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ltgs_jax.fit import (
+    InitialConfig,
+    LongConfig,
+    View,
+    VisitView,
+    Windows,
+    fit_chronology,
+    fit_initial,
+    fit_local,
+    photometric_loss,
+    splats_from_points,
+)
+from ltgs_jax.fit.chronology import placements_of
+from ltgs_jax.fit.growth import faint, recycle
+from ltgs_jax.geometry import SE3, Camera, stack_cameras
+from ltgs_jax.render import render
+from ltgs_jax.scene import Chronology, Splats, Template, compose
+
+_SIZE = 32
+
+
+def _camera(x: float) -> Camera:
+    K = jnp.asarray([[40.0, 0, 16], [0, 40, 16], [0, 0, 1]])
+    return Camera(SE3(jnp.asarray([1.0, 0, 0, 0]), jnp.asarray([x, 0.0, 3.0])), K, _SIZE, _SIZE)
+
+
+def _cloud(seed: int, count: int = 40, *, spread: float = 0.6) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        means=jnp.asarray(rng.uniform(-spread, spread, (count, 3)), jnp.float32),
+        quats=jnp.asarray(rng.normal(size=(count, 4)), jnp.float32),
+        log_scales=jnp.asarray(rng.uniform(-2.5, -1.8, (count, 3)), jnp.float32),
+        logit_opacities=jnp.asarray(rng.uniform(0, 3, count), jnp.float32),
+        sh=jnp.asarray(rng.uniform(-1, 1.5, (count, 1, 3)), jnp.float32),
+    )
+
+
+def _view(splats: Splats, camera: Camera) -> View:
+    image = np.clip(np.asarray(render(splats, camera).image), 0, 1)
+    return View(camera, np.rint(255 * image).astype(np.uint8), np.ones((_SIZE, _SIZE), bool))
+
+
+def test_loss_sees_nothing_outside_the_mask():
+    rng = np.random.default_rng(0)
+    image, target = (jnp.asarray(rng.uniform(size=(24, 24, 3)), jnp.float32) for _ in range(2))
+    mask = np.zeros((24, 24), bool)
+    mask[4:12, 4:12] = True
+    other = jnp.where(jnp.asarray(mask)[..., None], image, 1 - image)
+    a = photometric_loss(image, target, jnp.asarray(mask), dssim=0.2)
+    b = photometric_loss(other, target, jnp.asarray(mask), dssim=0.2)
+    assert float(a) > 0.05
+    np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
+def test_splitting_keeps_the_image_and_fills_free_slots():
+    splats = _cloud(1)
+    splats = eqx.tree_at(lambda s: s.logit_opacities, splats, splats.logit_opacities.at[30:].set(-20.0))
+    scores = jnp.arange(40.0)
+    split, replaced = recycle(splats, scores, jnp.asarray(5))
+    assert int(jnp.sum(~faint(split))) == 35
+    assert int(jnp.sum(replaced)) == 10
+    before, after = render(splats, _camera(0.0)).image, render(split, _camera(0.0)).image
+    assert float(jnp.mean(jnp.abs(before - after))) < 0.02
+    untouched = ~np.asarray(replaced)
+    np.testing.assert_array_equal(np.asarray(split.means)[untouched], np.asarray(splats.means)[untouched])
+
+
+def test_nothing_is_split_without_error_or_room():
+    splats = _cloud(2)
+    for scores in (jnp.zeros(40), jnp.ones(40)):  # no error; no free slot
+        split, replaced = recycle(splats, scores, jnp.asarray(8))
+        assert not bool(replaced.any())
+        assert all(bool((a == b).all()) for a, b in zip(jax.tree.leaves(split), jax.tree.leaves(splats), strict=True))
+
+
+def test_points_become_splats_with_their_colours_and_too_few_are_refused():
+    rng = np.random.default_rng(3)
+    points, colors = rng.uniform(-1, 1, (10, 3)), rng.uniform(size=(10, 3))
+    splats = splats_from_points(points, colors, capacity=16, sh_degree=1)
+    assert splats.sh.shape == (16, 4, 3)
+    np.testing.assert_allclose(np.asarray(splats.sh[:10, 0]) * 0.28209479 + 0.5, colors, atol=1e-6)
+    np.testing.assert_array_equal(np.asarray(faint(splats)), np.arange(16) >= 10)
+    with pytest.raises(ValueError, match="at least 4"):
+        splats_from_points(points[:3], colors[:3], capacity=16, sh_degree=0)
+
+
+def test_initial_fit_learns_and_repeats_bit_for_bit():
+    truth = _cloud(4)
+    views = [_view(truth, _camera(x)) for x in (-0.3, 0.0, 0.3)]
+    rng = np.random.default_rng(5)
+    start = splats_from_points(
+        np.asarray(truth.means) + rng.normal(scale=0.02, size=(40, 3)),
+        np.full((40, 3), 0.5),
+        capacity=64,
+        sh_degree=0,
+    )
+    config = InitialConfig(steps=60, max_splats=64, sh_degree=0, coarse_fraction=0.0, grow_every=20)
+    first = fit_initial(start, views, key=jax.random.key(0), config=config)
+    assert first.losses[-6:].mean() < 0.6 * first.losses[:6].mean()
+    again = fit_initial(start, views, key=jax.random.key(0), config=config)
+    np.testing.assert_array_equal(first.losses, again.losses)
+    with pytest.raises(ValueError, match="at least one photograph"):
+        fit_initial(start, [], key=jax.random.key(0))
+
+
+def _moved_chronology(error: float) -> tuple[Chronology, Chronology]:
+    """A chronology whose one object moved at visit 1, and the same with its pose off by `error`."""
+    background, item = _cloud(6), _cloud(7, 20, spread=0.2)
+    poses = SE3(
+        jnp.asarray([[[1.0, 0, 0, 0]], [[0.98, 0, 0, 0.2]]]), jnp.asarray([[[0.0, 0, -0.5]], [[0.3, 0.1, -0.5]]])
+    )
+    truth = Chronology(
+        background, (Template(item, 1, 0),), poses, jnp.ones((2, 1), bool), jnp.zeros((0, 3, 2)), ("a", "b")
+    )
+    off = eqx.tree_at(lambda c: c.world_from_template.xyz, truth, poses.xyz.at[1, 0, 0].add(error))
+    return truth, off
+
+
+def test_long_fit_finds_the_pose_and_leaves_the_rest_alone():
+    truth, off = _moved_chronology(0.06)
+    views = [VisitView(_view(compose(truth, t), _camera(x)), t) for t in (0, 1) for x in (-0.3, 0.0, 0.3)]
+    frozen = jnp.zeros(off.background.count, bool)
+    config = LongConfig(steps=80, translation_rate=0.02, rotation_rate=2e-3)
+    fitted, losses = fit_chronology(off, views, movable=frozen, key=jax.random.key(0), config=config)
+    goal = truth.world_from_template.xyz[1, 0]
+    before = float(jnp.linalg.norm(off.world_from_template.xyz[1, 0] - goal))
+    after = float(jnp.linalg.norm(fitted.world_from_template.xyz[1, 0] - goal))
+    assert after < 0.5 * before
+    assert losses[-10:].mean() < losses[:10].mean()
+    for a, b in zip(jax.tree.leaves(fitted.background), jax.tree.leaves(off.background), strict=True):
+        np.testing.assert_array_equal(a, b)
+    # The pose at the visit that the template was cut from is its frame, and stays.
+    np.testing.assert_allclose(fitted.world_from_template.xyz[0], off.world_from_template.xyz[0], atol=1e-7)
+
+
+def test_an_object_that_stays_has_one_pose():
+    truth, _ = _moved_chronology(0.0)
+    still = SE3(
+        jnp.repeat(truth.world_from_template.quat[:1], 2, 0), jnp.repeat(truth.world_from_template.xyz[:1], 2, 0)
+    )
+    placements = placements_of(eqx.tree_at(lambda c: c.world_from_template, truth, still))
+    assert placements.poses.xyz.shape == (1, 3)
+    assert placements_of(truth).poses.xyz.shape == (2, 3)
+
+
+def test_long_fit_wants_a_later_photograph():
+    truth, _ = _moved_chronology(0.0)
+    views = [VisitView(_view(compose(truth, 0), _camera(0.0)), 0)]
+    with pytest.raises(ValueError, match="later visit"):
+        fit_chronology(truth, views, movable=jnp.ones(40, bool), key=jax.random.key(0))
+
+
+def test_local_fit_lowers_the_error_in_its_windows():
+    truth = _cloud(8, 20, spread=0.2)
+    cameras = stack_cameras([_camera(x) for x in (-0.3, 0.3)])
+    target = render(truth, cameras).image
+    windows = Windows(
+        cameras,
+        target,
+        jnp.zeros_like(target),
+        jnp.zeros(target.shape[:-1]),
+        jnp.ones(target.shape[:-1], bool),
+    )
+    start = eqx.tree_at(lambda s: (s.sh, s.logit_opacities), truth, (0 * truth.sh, truth.logit_opacities - 2))
+    fitted, losses = fit_local(start, windows, size=0.5, steps=40)
+    assert losses[-1] < 0.5 * losses[0]
+    assert fitted.count == start.count
