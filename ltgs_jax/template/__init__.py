@@ -1,0 +1,18 @@
+"""Rank 4: the splats of each object, and where they stand."""
+
+from .arrival import Placement as Placement
+from .arrival import build_template as build_template
+from .arrival import search_template as search_template
+from .arrival import settle_template as settle_template
+from .arrival import support_below as support_below
+from .background import color_from_photographs as color_from_photographs
+from .background import fill_under as fill_under
+from .config import TemplateConfig as TemplateConfig
+from .locate import Crop as Crop
+from .locate import Refiner as Refiner
+from .locate import backdrop_error as backdrop_error
+from .locate import make_crop as make_crop
+from .removal import Removal as Removal
+from .removal import find_removed as find_removed
+from .support import Support as Support
+from .support import fit_support as fit_support

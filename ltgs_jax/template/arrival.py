@@ -1,0 +1,285 @@
+"""Something came: a known template at a new pose, or a new object built from its outlines and photographs."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from scipy import ndimage
+
+from ltgs_jax.geometry import C0, SE3, quat_from_rotmat
+from ltgs_jax.match import Cone, Instance, carve, grid_around
+from ltgs_jax.scene import Splats, Template
+
+from .config import TemplateConfig
+from .locate import Crop, Refiner, backdrop_error, point_colors, score_points
+from .support import Support, fit_support
+
+
+class Placement(eqx.Module):
+    """A template found again: its pose, the mean colour error with it, the share of the change it explains, and the
+    share of its outlines that lies on the change."""
+
+    world_from_template: SE3
+    error: float
+    gain: float
+    overlap: float
+
+
+def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The smallest rotation that takes unit vector a to b."""
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -0.999999:
+        other = np.eye(3)[np.argmin(np.abs(a))]
+        axis = np.cross(a, other)
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + skew + skew @ skew / (1 + cosine)
+
+
+def _turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+def pose_hypotheses(
+    template: Float[np.ndarray, "n 3"],
+    stood_on: Support,
+    stands_on: Support,
+    place: Float[np.ndarray, "3"],
+    *,
+    turns: int,
+    spread: float,
+    tilts: Sequence[Float[np.ndarray, "3 3"]] = (np.eye(3),),
+) -> SE3:
+    """Poses of a template (points in its frame, on `stood_on`) on another support around `place` (scene units).
+
+    For each tilt and each of `turns` turns about the normal: a 7 × 7 grid of places, `spread` wide; the lowest points
+    touch the support.
+    """
+    center = np.median(template, axis=0)
+    align = rotation_between(stood_on.normal, stands_on.normal)
+    axes = stands_on.frame()
+    offsets = [np.zeros(3)] + [spread * (np.cos(a) * axes[0] + np.sin(a) * axes[1]) for a in np.arange(8) * np.pi / 4]
+    matrices = []
+    for tilt in tilts:
+        for turn in range(turns):
+            rotation = _turn(stands_on.normal, 2 * np.pi * turn / turns) @ align @ tilt
+            height = stands_on.height((template - center) @ rotation.T)
+            rest = place - stands_on.normal * (stands_on.height(place[None])[0])
+            lift = -(np.quantile(height, 0.02) + stands_on.offset) * stands_on.normal
+            for offset in offsets:
+                matrix = np.eye(4)
+                matrix[:3, :3] = rotation
+                matrix[:3, 3] = rest + offset + lift - rotation @ center
+                matrices.append(matrix)
+    return SE3.from_matrix(jnp.asarray(np.stack(matrices), jnp.float32))
+
+
+def tilts_of(support: Support) -> list[Float[np.ndarray, "3 3"]]:
+    """The rotations that lay an object on each of its other five sides."""
+    u, v, _ = support.frame()
+    return [_turn(u, np.pi / 2), _turn(u, -np.pi / 2), _turn(v, np.pi / 2), _turn(v, -np.pi / 2), _turn(u, np.pi)]
+
+
+def thin(splats: Splats, most: int) -> Splats:
+    """Exactly `most` splats: those of largest opacity × area, made to cover as much as all did, or padded with
+    invisible ones, so that every template runs in one compiled program."""
+    if splats.count <= most:
+        missing = most - splats.count
+        padded = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
+        faint = padded.logit_opacities.at[splats.count :].set(-jnp.inf)
+        return eqx.tree_at(lambda s: s.logit_opacities, padded, faint)
+    area = np.exp(np.sum(np.sort(np.asarray(splats.log_scales), axis=1)[:, 1:], axis=1)) * np.asarray(splats.opacities)
+    keep = np.sort(np.argsort(-area, kind="stable")[:most])
+    grow = 0.5 * np.log(area.sum() / area[keep].sum())
+    return eqx.tree_at(lambda s: s.log_scales, splats[keep], splats.log_scales[keep] + min(grow, 0.7))
+
+
+class Search(eqx.Module):
+    """Promising poses of a template and the mean colour error with it at each, by points alone; the error `without`
+    it, and the part of that which is to be explained."""
+
+    template: Splats
+    poses: SE3
+    errors: Float[np.ndarray, " m"]
+    without: float
+    change: float
+
+    def gain(self, error: float) -> float:
+        """Share of the change that is explained when `error` is left; what is drawn beside it counts against."""
+        return (self.without - error) / max(self.change, 1e-9)
+
+    @property
+    def best_gain(self) -> float:
+        """The gain of the best of the poses."""
+        return self.gain(float(self.errors.min()))
+
+
+def search_template(
+    template: Template,
+    stood_on: Support,
+    stands_on: Support,
+    place: Float[np.ndarray, "3"],
+    crop: Crop,
+    *,
+    size: float,
+    config: TemplateConfig = TemplateConfig(),
+) -> Search:
+    """Poses at which a template's points, at many turns and places on the support, look like the photographs.
+
+    Upright first; on its other sides too if upright explains little. The best four, unlike each other.
+    """
+    light = thin(template.splats, config.search_splats)
+    shown = np.asarray(light.opacities) > 0.1
+    points, colors = np.asarray(light.means, np.float64)[shown], point_colors(light)[shown]
+    without, change = backdrop_error(crop)
+    best: Search | None = None
+    for tilts in ([np.eye(3)], tilts_of(stood_on)):
+        hypotheses = pose_hypotheses(
+            points, stood_on, stands_on, place, turns=config.yaw_steps, spread=size, tilts=tilts
+        )
+        scores = score_points(points, colors, hypotheses, crop, tolerance=0.1 * size)
+        chosen = _unlike(hypotheses, scores, 4, distance=0.1 * size, angle=0.4)
+        found = Search(light, hypotheses[chosen], scores[chosen], without, change)
+        if best is None or found.errors.min() < best.errors.min():
+            best = found
+        if best.best_gain > config.tau_gain:
+            break
+    assert best is not None
+    return best
+
+
+def settle_template(search: Search, stands_on: Support, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
+    """Refine the poses of a search on the pixels, then try the best of them turned by quarters: things that look alike
+    from two sides settle on the wrong one easily."""
+    tolerance = 0.1 * size
+    found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=tolerance)
+    winner = found.poses[int(np.argmin(found.errors))]
+    means = np.asarray(search.template.means)[np.asarray(search.template.opacities) > 0.1]
+    center = np.asarray(winner.apply(jnp.asarray(np.median(means, axis=0))[None]))[0]
+    turned = []
+    for quarter in range(4):
+        turn = np.eye(4)
+        turn[:3, :3] = _turn(stands_on.normal, quarter * np.pi / 2)
+        turn[:3, 3] = center - turn[:3, :3] @ center
+        turned.append(turn @ np.asarray(winner.as_matrix()))
+    quarters = SE3.from_matrix(jnp.asarray(np.stack(turned), jnp.float32))
+    again = refiner.refine(search.template, quarters, crop, size=size, tolerance=tolerance)
+    best = int(np.argmin(again.errors))
+    error = float(again.errors[best])
+    return Placement(again.poses[best], error, search.gain(error), float(again.overlaps[best]))
+
+
+def _unlike(
+    poses: SE3, scores: Float[np.ndarray, " m"], count: int, *, distance: float, angle: float
+) -> Int[np.ndarray, " count"]:
+    """The best poses by score, each at least `distance` or `angle` (radians) from the better ones."""
+    xyz, quat = np.asarray(poses.xyz), np.asarray(poses.quat)
+    order = np.argsort(scores, kind="stable")
+    chosen: list[int] = []
+    for i in order:
+        turned = [2 * np.arccos(np.clip(abs(quat[i] @ quat[j]), 0, 1)) for j in chosen]
+        moved = [np.linalg.norm(xyz[i] - xyz[j]) for j in chosen]
+        if all(a > angle or d > distance for a, d in zip(turned, moved, strict=True)):
+            chosen.append(int(i))
+        if len(chosen) == count:
+            break
+    return np.asarray(chosen + chosen[:1] * (count - len(chosen)))
+
+
+def support_below(
+    instance: Instance,
+    surface: Float[np.ndarray, "n 3"],
+    weights: Float[np.ndarray, " n"],
+    cameras: Float[np.ndarray, "c 3"],
+    *,
+    rng: np.random.Generator,
+) -> Support | None:
+    """The plane, among known surface points near an instance, that it stands on."""
+    center = np.median(instance.points, axis=0)
+    radius = np.quantile(np.linalg.norm(instance.points - center, axis=1), 0.95) + 1e-9
+    near = np.linalg.norm(surface - center, axis=1) < 2.5 * radius
+    return fit_support(surface[near], weights[near], instance.points, cameras, rng=rng)
+
+
+def build_template(
+    instance: Instance,
+    support: Support | None,
+    cones: Sequence[Cone],
+    photographs: Sequence[Float[np.ndarray, "h w 3"]],
+    *,
+    identity: int,
+    visit: int,
+    coefficients: int,
+    rng: np.random.Generator,
+    config: TemplateConfig = TemplateConfig(),
+) -> Template | None:
+    """A new object's splats: the surface of its visual hull above its support, coloured by the photographs.
+
+    Centres on the hull's boundary, identity rotation, spacing as scale, the paper's opacity; colour from the photograph
+    that sees the point most squarely among those that see it. None when the outlines enclose nothing.
+    """
+    frame = support.frame() if support is not None else np.eye(3)
+    grid = grid_around(instance.points, frame, resolution=config.hull_resolution)
+    centers = grid.centers()
+    outlines = [Cone(c.projection, r, c.valid, c.depth) for c, r in zip(cones, instance.regions, strict=True)]
+    counts = carve(centers, outlines, tolerance=grid.voxel)
+    solid = (counts[:, 0] >= max(1, min(2, instance.views))) & (counts[:, 1] == 0)
+    if support is not None:
+        solid &= support.height(centers) > -0.5 * grid.voxel
+    solid = solid.reshape(grid.shape)
+    labels = ndimage.label(solid, np.ones((3, 3, 3)))[0]
+    if labels.max() == 0:
+        return None
+    largest = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
+    padded = np.pad(largest, 1)
+    boundary = (padded & ~ndimage.binary_erosion(padded))[1:-1, 1:-1, 1:-1]
+    normals = -np.stack(np.gradient(ndimage.gaussian_filter(padded.astype(float), 1.5)), axis=-1)[1:-1, 1:-1, 1:-1]
+    index = boundary.ravel()
+    points, normals = centers[index], normals.reshape(-1, 3)[index] @ frame
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9
+    if len(points) > config.new_splats:
+        keep = rng.choice(len(points), config.new_splats, replace=False)
+        points, normals = points[keep], normals[keep]
+    colors, seen = _colors(points, normals, outlines, photographs)
+    if not seen.any():
+        return None
+    colors[~seen] = np.median(colors[seen], axis=0)
+    n = len(points)
+    sh = np.zeros((n, coefficients, 3), np.float32)
+    sh[:, 0] = (colors - 0.5) / C0
+    logit = np.log(config.new_opacity / (1 - config.new_opacity))
+    splats = Splats(
+        means=jnp.asarray(points, jnp.float32),
+        quats=jnp.tile(quat_from_rotmat(jnp.eye(3, dtype=jnp.float32)), (n, 1)),
+        log_scales=jnp.full((n, 3), np.log(0.7 * grid.voxel), jnp.float32),
+        logit_opacities=jnp.full(n, logit, jnp.float32),
+        sh=jnp.asarray(sh),
+    )
+    return Template(splats, identity, visit)
+
+
+def _colors(points, normals, cones: Sequence[Cone], photographs) -> tuple[np.ndarray, np.ndarray]:
+    """Colour of each point from the photograph that looks at it most squarely, and whether any does."""
+    colors = np.zeros((len(points), 3))
+    best = np.full(len(points), 0.05)
+    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
+    for cone, photograph in zip(cones, photographs, strict=True):
+        left = cone.projection[:, :3]
+        center = -np.linalg.solve(left, cone.projection[:, 3])
+        view = center - points
+        facing = np.sum(view * normals, axis=1) / np.linalg.norm(view, axis=1)
+        x, y, z = (homogeneous @ cone.projection.T).T
+        column = np.floor(x / np.maximum(z, 1e-6)).astype(int)
+        row = np.floor(y / np.maximum(z, 1e-6)).astype(int)
+        h, w = cone.silhouette.shape
+        inside = (z > 1e-6) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        inside[inside] &= cone.silhouette[row[inside], column[inside]]
+        better = inside & (facing > best)
+        colors[better] = photograph[row[better], column[better]]
+        best[better] = facing[better]
+    return colors, best > 0.05

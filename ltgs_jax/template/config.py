@@ -1,0 +1,41 @@
+"""Options of the template stage."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class TemplateConfig:
+    """How objects are cut out, built and found again."""
+
+    min_pixels: float = 4e-4
+    """Smallest evidence for an object, as a share of a photograph's pixels."""
+    flat: float = 3.0
+    """What rises above its support by less than this many times the support's noise is no object."""
+    fill_splats: int = 2500
+    """Most splats laid where an object's removal bares the surface below."""
+    hull_resolution: int = 40
+    """Voxels along the longest edge of a new object's visual hull."""
+    new_splats: int = 2048
+    """Most splats a new object starts with."""
+    tau_new: float = 0.4
+    """Share of the change that a new object must explain after its short fit."""
+    faint: float = 0.05
+    """Mean colour difference, in 0…1, below which what changed is no object."""
+    new_steps: int = 80
+    """Steps of the short fit of a new object, before its template is used."""
+    new_opacity: float = 0.1
+    """Opacity a new object's splats start with (the paper's)."""
+    yaw_steps: int = 24
+    """Turns about the support's normal tried for a known template."""
+    window: int = 56
+    """Pixels along the edge of the windows in which poses are compared."""
+    candidates: int = 2
+    """Known templates, best by points, whose pose is refined for one arrival."""
+    search_splats: int = 1024
+    """Splats of a template while its pose is sought."""
+    tau_gain: float = 0.4
+    """Share of the photometric error that a known template must explain to be taken for what came."""
+    tau_outline: float = 0.75
+    """Least share of a known template's outlines that lies on what changed."""
+    tau_overlap: float = 0.15
+    """τ_overlap: largest Chamfer distance of two aligned templates, in units of their size."""

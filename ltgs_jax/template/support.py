@@ -1,0 +1,89 @@
+"""The surface that an object stands on, found in the splats around it."""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import Delaunay, QhullError
+
+
+class Support(eqx.Module):
+    """A plane normal·x = offset, its normal towards the cameras, with the residual noise of its points."""
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    noise: float
+
+    def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+        """Signed distance of points above the plane, in scene units."""
+        return points @ self.normal - self.offset
+
+    def frame(self) -> Float[np.ndarray, "3 3"]:
+        """Rows: two axes in the plane and the normal."""
+        seed = np.eye(3)[np.argmin(np.abs(self.normal))]
+        u = np.cross(self.normal, seed)
+        u /= np.linalg.norm(u)
+        return np.stack([u, np.cross(self.normal, u), self.normal])  # right-handed
+
+
+def fit_support(
+    points: Float[np.ndarray, "n 3"],
+    weights: Float[np.ndarray, " n"],
+    above: Float[np.ndarray, "m 3"],
+    cameras: Float[np.ndarray, "c 3"],
+    *,
+    rng: np.random.Generator,
+    trials: int = 400,
+) -> Support | None:
+    """The plane through most of `points` that has the points `above` and the cameras on its upper side, or None.
+
+    RANSAC with a truncated loss whose bound is 2.5 % of the points' spread, then least squares on the inliers. A plane
+    must have the object on its upper side and in touch with it, so that a wall behind it does not win over the table
+    below.
+    """
+    if len(points) < 12:
+        return None
+    center = np.average(points, axis=0, weights=weights)
+    spread = np.sqrt(np.average(np.sum((points - center) ** 2, axis=1), weights=weights))
+    bound = 0.025 * spread
+    reach = 0.1 * np.linalg.norm(np.ptp(above, axis=0)) + 2 * bound
+    probability = weights / weights.sum()
+    best_score, best = 0.0, None
+    for _ in range(trials):
+        a, b, c = points[rng.choice(len(points), 3, replace=False, p=probability)]
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal)
+        if length < 1e-9 * spread**2:
+            continue
+        normal /= length
+        if np.median((cameras - a) @ normal) < 0:
+            normal = -normal
+        distance = (points - a) @ normal
+        inlier = np.sum(weights * np.maximum(0, 1 - (distance / bound) ** 2))
+        height = (above - a) @ normal
+        over = np.mean(height > -reach)
+        touch = np.exp(-0.5 * (np.quantile(height, 0.05) / reach) ** 2)
+        score = inlier * over**2 * touch
+        if score > best_score:
+            best_score, best = score, (normal, a)
+    if best is None:
+        return None
+    normal, a = best
+    for _ in range(3):
+        near = np.abs((points - a) @ normal) < bound
+        if near.sum() < 6:
+            return None
+        a = np.average(points[near], axis=0, weights=weights[near])
+        centered = (points[near] - a) * np.sqrt(weights[near])[:, None]
+        refined = np.linalg.svd(centered, full_matrices=False)[2][2]
+        normal = refined if refined @ normal > 0 else -refined
+    near = np.abs((points - a) @ normal) < bound
+    noise = float(1.4826 * np.median(np.abs((points[near] - a) @ normal))) + 1e-6 * spread
+    return Support(normal, float(normal @ a), noise)
+
+
+def convex_footprint(points: Float[np.ndarray, "n 2"], queries: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
+    """Which queries lie within the convex hull of points in the plane."""
+    try:
+        return Delaunay(points).find_simplex(queries) >= 0
+    except QhullError:
+        return np.zeros(len(queries), bool)

@@ -1,0 +1,171 @@
+"""Supports, cutting out, filling, and finding a template again."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ltgs_jax.geometry import C0, SE3, Camera, rotation_angle, stack_cameras
+from ltgs_jax.render import render
+from ltgs_jax.scene import Splats, Template
+from ltgs_jax.template import (
+    Crop,
+    Refiner,
+    Support,
+    TemplateConfig,
+    fill_under,
+    find_removed,
+    fit_support,
+    search_template,
+    settle_template,
+)
+from ltgs_jax.template.cut import neighbour_graph, random_walk
+from ltgs_jax.template.removal import gone_evidence
+
+
+def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
+    n = len(points)
+    sh = np.zeros((n, 1, 3), np.float32)
+    sh[:, 0] = (colors - 0.5) / C0
+    return Splats(
+        means=jnp.asarray(points, jnp.float32),
+        quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)),
+        log_scales=jnp.full((n, 3), np.log(scale), jnp.float32),
+        logit_opacities=jnp.full(n, 3.0, jnp.float32),
+        sh=jnp.asarray(sh),
+    )
+
+
+def _table(rng: np.random.Generator, count: int = 1500) -> np.ndarray:
+    return np.concatenate([rng.uniform(-1, 1, (count, 2)), rng.normal(scale=0.004, size=(count, 1))], axis=1)
+
+
+def _box(rng: np.random.Generator, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the faces of a box that stands on z = 0, each face of its own colour."""
+    half = np.array([0.12, 0.08, 0.15])
+    points = rng.uniform(-1, 1, (count, 3))
+    face, sign = rng.integers(0, 3, count), rng.choice([-1.0, 1.0], count)
+    points[np.arange(count), face] = sign
+    palette = np.array(
+        [[0.9, 0.1, 0.1], [0.1, 0.8, 0.2], [0.2, 0.2, 0.9], [0.9, 0.8, 0.1], [0.8, 0.2, 0.8], [0.1, 0.8, 0.8]]
+    )
+    return points * half + [0, 0, half[2]], palette[2 * face + (sign > 0)]
+
+
+_CAMERAS = np.array([[2.0, 0, 1.5], [-1, 1.7, 1.5], [-1, -1.7, 1.5]])
+
+
+def test_support_is_the_table_not_the_wall():
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([np.full((1500, 1), -0.6), rng.uniform([-1, 0], [1, 1], (1500, 2))], axis=1)
+    points = np.concatenate([_table(rng), wall])
+    box, _ = _box(rng)
+    support = fit_support(points, np.ones(len(points)), box, _CAMERAS, rng=rng)
+    assert support is not None
+    np.testing.assert_allclose(support.normal, [0, 0, 1], atol=0.02)
+    assert abs(support.offset) < 0.01
+    np.testing.assert_allclose(support.frame() @ support.frame().T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(support.frame()) > 0
+
+
+def test_too_few_points_have_no_support():
+    rng = np.random.default_rng(0)
+    assert fit_support(rng.normal(size=(5, 3)), np.ones(5), rng.normal(size=(4, 3)), _CAMERAS, rng=rng) is None
+
+
+def test_what_one_photograph_sees_unchanged_did_not_leave():
+    seen = np.array([[5.0, 5, 0, 0], [5, 0, 5, 0]])
+    changed = np.array([[5.0, 5, 0, 0], [0, 0, 5, 0]])
+    left, stayed = gone_evidence(seen, changed)
+    assert left[0] == 0 and stayed[0] > 0
+    assert left[1] > 0 and left[2] > 0
+    assert left[3] == 0 and stayed[3] == 0
+
+
+def test_random_walk_reaches_the_side_without_evidence():
+    rng = np.random.default_rng(1)
+    table, (box, colors) = _table(rng), _box(rng)
+    means = np.concatenate([table, box + np.array([0, 0, 0.02])])
+    graph = neighbour_graph(means, np.concatenate([np.full((len(table), 3), 0.5), colors]), color_scale=0.5)
+    foreground = np.r_[np.zeros(len(table)), np.where(box[:, 0] > 0, 3.0, 0.0)]
+    background = np.r_[np.full(len(table), 3.0), np.zeros(len(box))]
+    probability = random_walk(graph, foreground, background)
+    assert (probability[len(table) :] > 0.5).mean() > 0.9
+    assert (probability[: len(table)] < 0.5).mean() > 0.95
+
+
+def test_a_box_is_cut_out_and_a_shadow_is_not():
+    rng = np.random.default_rng(2)
+    table, (box, colors) = _table(rng), _box(rng)
+    means = np.concatenate([table, box])
+    splats = _splats(means, np.concatenate([np.full((len(table), 3), 0.5), colors]), 0.02)
+    on_box = np.arange(len(means)) >= len(table)
+    shadow = ~on_box & (np.linalg.norm(means[:, :2] - [0.6, 0.6], axis=1) < 0.2)
+    seen = np.full((3, len(means)), 4.0)
+    changed = np.where(on_box | shadow, 4.0, 0.0) * np.ones((3, 1))
+    found = find_removed(splats, seen, changed, _CAMERAS, pixels=100_000, rng=rng)
+    assert len(found) == 1
+    members = found[0].members
+    assert members[on_box].mean() > 0.95
+    assert members[~on_box & (np.linalg.norm(means[:, :2], axis=1) > 0.3)].sum() == 0
+    assert found[0].views == 3
+
+
+def test_nothing_changed_nothing_removed():
+    rng = np.random.default_rng(3)
+    splats = _splats(_table(rng), np.full((1500, 3), 0.5), 0.02)
+    seen = np.full((3, 1500), 4.0)
+    assert find_removed(splats, seen, 0 * seen, _CAMERAS, pixels=100_000, rng=rng) == []
+
+
+def test_the_ground_under_a_box_is_filled_with_the_table_colour():
+    rng = np.random.default_rng(4)
+    table = _table(rng)
+    table = table[(np.abs(table[:, 0]) > 0.13) | (np.abs(table[:, 1]) > 0.09)]
+    colors = np.tile([0.7, 0.5, 0.3], (len(table), 1))
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
+    fill = fill_under(_splats(table, colors, 0.02), _box(rng)[0], support)
+    assert fill.count > 4
+    assert np.abs(np.asarray(fill.means)[:, 2]).max() < 1e-6
+    np.testing.assert_allclose(
+        np.asarray(fill.sh[:, 0]) * C0 + 0.5, np.tile([0.7, 0.5, 0.3], (fill.count, 1)), atol=1e-3
+    )
+    whole = fill_under(_splats(_table(rng, 20_000), np.full((20_000, 3), 0.5), 0.03), _box(rng)[0], support)
+    assert whole.count < 0.1 * fill.count
+
+
+def _crop(splats: Splats, size: int) -> Crop:
+    cameras = []
+    for eye in _CAMERAS:
+        forward = (np.array([0.1, 0.1, 0.1]) - eye) / np.linalg.norm(np.array([0.1, 0.1, 0.1]) - eye)
+        right = np.cross(forward, [0, 0, 1])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = rotation, -rotation @ eye
+        K = jnp.asarray([[2.5 * size, 0, size / 2], [0, 2.5 * size, size / 2], [0, 0, 1]], jnp.float32)
+        cameras.append(Camera(SE3.from_matrix(jnp.asarray(matrix, jnp.float32)), K, size, size))
+    batch = stack_cameras(cameras)
+    out = render(splats, batch, background=jnp.full(3, 0.5))
+    backdrop = jnp.full_like(out.image, 0.5)
+    valid = jnp.ones(out.alpha.shape, bool)
+    return Crop(batch, jnp.clip(out.image, 0, 1), backdrop, jnp.full_like(out.alpha, 50.0), valid, out.alpha > 0.5)
+
+
+def test_a_template_is_found_where_it_stands_now():
+    rng = np.random.default_rng(5)
+    points, colors = _box(rng)
+    template = Template(_splats(points, colors, 0.015), 1, 0)
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
+    angle = 2.1
+    truth = SE3(jnp.asarray([np.cos(angle / 2), 0, 0, np.sin(angle / 2)], jnp.float32), jnp.asarray([0.12, 0.07, 0.0]))
+    turned = eqx.tree_at(lambda s: s.means, template.splats, truth.apply(template.splats.means))
+    crop = _crop(turned, 40)
+    config = TemplateConfig(search_splats=512)
+    place = np.array([0.1, 0.1, 0.15])
+    search = search_template(template, support, support, place, crop, size=0.42, config=config)
+    placement = settle_template(search, support, crop, size=0.42, refiner=Refiner())
+    error = placement.world_from_template.inverse() @ truth
+    assert placement.gain > 0.8
+    assert placement.overlap > 0.8
+    assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(3)
+    assert float(jnp.linalg.norm(placement.world_from_template.xyz - truth.xyz)) < 0.03 * 0.42
