@@ -40,7 +40,7 @@ FOREIGN = {
     "localize": {"cv2", "pycolmap"},
     "detect": {"cv2", "skimage"},
     "match": {"cv2", "skimage"},
-    "pipeline": {"cv2"},
+    "pipeline": {"cv2", "safetensors"},
     "cli": {"tyro", "rich"},
     "report": {"cv2"},
     "demo": {"cv2"},

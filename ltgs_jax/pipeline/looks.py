@@ -1,0 +1,126 @@
+"""The present scene as a visit's photographs should show it, rendered with few compilations."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ltgs_jax.geometry import Camera
+from ltgs_jax.match import Cone
+from ltgs_jax.render import RenderPlan, plan_render, render, splat_votes
+from ltgs_jax.scene import Splats
+from ltgs_jax.template import Refiner
+
+_BUCKET = 8192  # splat counts are padded to multiples of this, so that a cut or an addition compiles nothing anew
+
+
+class Observation(eqx.Module):
+    """One photograph of a visit, in the light of the first: camera, colours in 0…1, pixels that count."""
+
+    name: str = eqx.field(static=True)
+    camera: Camera
+    image: Float[np.ndarray, "h w 3"]
+    valid: Bool[np.ndarray, "h w"]
+
+
+class Look(eqx.Module):
+    """What the scene shows to one camera."""
+
+    image: Float[np.ndarray, "h w 3"]
+    alpha: Float[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    expected: Float[np.ndarray, "h w"]
+
+
+def on_host(splats: Splats) -> Splats:
+    """The same splats as NumPy arrays: cutting and joining them then compiles nothing."""
+    return jax.tree.map(np.asarray, splats)
+
+
+def pad_splats(splats: Splats, *, multiple: int = _BUCKET) -> Splats:
+    """Invisible splats at the end, up to a multiple."""
+    missing = -splats.count % multiple
+    host = on_host(splats)
+    padded = jax.tree.map(lambda leaf: np.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), host)
+    padded.logit_opacities[splats.count :] = -np.inf
+    return padded
+
+
+@eqx.filter_jit
+def _render(splats: Splats, camera: Camera, plan: RenderPlan):
+    return render(splats, camera, plan=plan)
+
+
+@eqx.filter_jit
+def _render_values(splats: Splats, camera: Camera, values, plan: RenderPlan):
+    out = render(splats, camera, plan=plan, colors=values)
+    return out.image, out.overflow
+
+
+@eqx.filter_jit
+def _votes(splats: Splats, camera: Camera, values, plan: RenderPlan):
+    return splat_votes(splats, camera, values, plan=plan)
+
+
+class Eye:
+    """Renders whole photographs; keeps one generous plan per image size and bucket, growing it when one overflows."""
+
+    def __init__(self) -> None:
+        self._plans: dict[tuple[int, int, int], RenderPlan] = {}
+        self.refiner = Refiner()
+
+    def _plan(self, splats: Splats, camera: Camera) -> RenderPlan:
+        key = (splats.count, camera.width, camera.height)
+        needed = plan_render(splats, camera, slack=1.0)
+        held = self._plans.get(key)
+        if held is None or needed.intersections > held.intersections or needed.rounds > held.rounds:
+            roomy = plan_render(splats, camera, slack=1.8)
+            held = (
+                roomy
+                if held is None
+                else RenderPlan(max(roomy.intersections, held.intersections), max(roomy.rounds, held.rounds))
+            )
+            self._plans[key] = held
+        return held
+
+    def look(self, splats: Splats, camera: Camera, errors: Float[np.ndarray, " n"]) -> Look:
+        """Image, alpha, depth and expected dissimilarity; where little is, nothing is expected to agree."""
+        padded = pad_splats(splats)
+        plan = self._plan(padded, camera)
+        out = _render(padded, camera, plan)
+        values = np.pad(np.asarray(errors, np.float32), (0, padded.count - splats.count))[:, None]
+        expected, _ = _render_values(padded, camera, values, plan)
+        alpha = np.asarray(out.alpha)
+        unknown = np.clip(1 - 2 * alpha, 0, 1)
+        return Look(
+            np.clip(np.asarray(out.image), 0, 1), alpha, np.asarray(out.depth), np.asarray(expected)[..., 0] + unknown
+        )
+
+    def image(self, splats: Splats, camera: Camera) -> Float[np.ndarray, "h w 3"]:
+        """The image alone, in 0…1."""
+        padded = pad_splats(splats)
+        return np.clip(np.asarray(_render(padded, camera, self._plan(padded, camera)).image), 0, 1)
+
+    def paint(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
+        """Any values of the splats, composited as colours are."""
+        padded = pad_splats(splats)
+        values = np.pad(np.asarray(values, np.float32), ((0, padded.count - splats.count), (0, 0)))
+        return np.asarray(_render_values(padded, camera, values, self._plan(padded, camera))[0])
+
+    def votes(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "n m"]:
+        """Σ αT·value per splat."""
+        padded = pad_splats(splats)
+        votes = _votes(padded, camera, jnp.asarray(values, jnp.float32), self._plan(padded, camera))
+        return np.asarray(votes)[: splats.count]
+
+
+def projection_of(camera: Camera) -> Float[np.ndarray, "3 4"]:
+    """K·[R t] in float64."""
+    K = np.asarray(camera.K, np.float64)
+    return K @ np.asarray(camera.cam_from_world.as_matrix(), np.float64)[:3]
+
+
+def cone_of(camera: Camera, silhouette: Bool[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"], look: Look) -> Cone:
+    """A photograph's evidence as `match` takes it."""
+    return Cone(projection_of(camera), silhouette, valid, look.depth)

@@ -1,0 +1,226 @@
+"""What a run leaves behind: the files of contract.md."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from ltgs_jax.geometry import SE3, Camera, rotation_angle
+from ltgs_jax.io import (
+    InputError,
+    distort_labels,
+    read_json,
+    save_chronology,
+    write_image,
+    write_json,
+    write_labels,
+    write_ply,
+    write_tracks,
+)
+from ltgs_jax.scene import Chronology, Splats, compose, drop_hidden
+
+from .looks import Eye
+from .visit import Account
+
+_STILL = 1e-3  # a pose that changed by less, in object sizes or radians, did not change
+
+
+def write_outputs(
+    out: Path,
+    run,
+    chronology: Chronology,
+    initial: Splats,
+    accounts: Sequence[Sequence[Account]],
+    eye: Eye,
+    store,
+    progress,
+) -> None:
+    """Write the chronology, one PLY per visit and per object, tracks, masks and renders."""
+
+    def compute():
+        save_chronology(out, chronology)
+        prefix = run.capture.folder.resolve().name
+        scenes = [drop_hidden(compose(chronology, t)) for t in range(len(chronology.visits))]
+        for t, scene in enumerate(scenes):
+            write_ply(out / "splats" / f"{prefix}_{t:04d}.ply", scene)
+        for template in chronology.templates:
+            write_ply(out / "objects" / f"object_{template.identity:04d}.ply", template.splats)
+        write_ply(out / "initial.ply", initial)
+        cameras = {p.name: p for p in run.capture.photographs if p.name in run.cameras}
+        write_json(
+            out / "cameras.json",
+            {
+                "capture": str(run.capture.folder.resolve()),
+                "photographs": {
+                    name: {"visit": p.visit, "role": p.role, **_camera_json(run.cameras[name])}
+                    for name, p in cameras.items()
+                },
+            },
+        )
+        shown = [p for p in cameras.values() if (p.visit > 0 and p.role in ("update", "test")) or p.role == "test"]
+        manifest = []
+        for i, photograph in enumerate(shown):
+            progress.step(i, len(shown), f"rendering {photograph.name}")
+            camera = run.cameras[photograph.name]
+            name = Path(photograph.name).with_suffix(".png")
+            write_image(out / "renders" / name, eye.image(scenes[photograph.visit], camera))
+            write_image(out / "renders_initial" / name, eye.image(initial, camera))
+            entry = {
+                "name": photograph.name,
+                "visit": photograph.visit,
+                "role": photograph.role,
+                "capture_path": str(photograph.path.resolve()),
+                "render_path": str(Path("renders") / name),
+                "initial_render_path": str(Path("renders_initial") / name),
+                "mask_path": None,
+            }
+            if photograph.role == "update":
+                labels = object_labels(chronology, photograph.visit, camera, eye)
+                write_labels(out / "masks" / name, distort_labels(labels, photograph))
+                entry["mask_path"] = str(Path("masks") / name)
+            manifest.append(entry)
+        write_json(out / "report.json", {"photographs": manifest})
+        objects = [_track(chronology, k, accounts, run) for k in range(len(chronology.templates))]
+        write_tracks(
+            out / "tracks.json",
+            visits=list(chronology.visits),
+            photographs=[s for s in run.statuses if not s["name"].startswith(f"{chronology.visits[0]}/")],
+            objects=objects,
+        )
+        return {}, {"counts": {"files": len(scenes) + len(objects) + 2 * len(shown), "objects": len(objects)}}
+
+    store.run("outputs", never(), compute)
+
+
+def never() -> str:
+    """A key that no earlier run has: what is cheap to write is written again."""
+    import secrets
+
+    return secrets.token_hex(8)
+
+
+def _camera_json(camera: Camera) -> dict:
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "K": np.asarray(camera.K, float).tolist(),
+        "cam_from_world": {
+            "wxyz": np.asarray(camera.cam_from_world.quat, float).tolist(),
+            "xyz": np.asarray(camera.cam_from_world.xyz, float).tolist(),
+        },
+    }
+
+
+def read_cameras(out: Path) -> tuple[Path, dict[str, tuple[int, str, Camera]]]:
+    """The capture's folder, and visit, role and camera of each placed photograph, from cameras.json."""
+    path = out / "cameras.json"
+    content = read_json(path)
+    try:
+        cameras = {
+            name: (
+                int(entry["visit"]),
+                str(entry["role"]),
+                Camera(
+                    SE3(
+                        jnp.asarray(entry["cam_from_world"]["wxyz"], jnp.float32),
+                        jnp.asarray(entry["cam_from_world"]["xyz"], jnp.float32),
+                    ),
+                    jnp.asarray(entry["K"], jnp.float32),
+                    int(entry["width"]),
+                    int(entry["height"]),
+                ),
+            )
+            for name, entry in content["photographs"].items()
+        }
+        return Path(content["capture"]), cameras
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: is not a list of cameras ({error})") from None
+
+
+def object_labels(chronology: Chronology, t: int, camera: Camera, eye: Eye) -> Int[np.ndarray, "h w"]:
+    """Identity of the object that each pixel shows mostly, 0 where it shows none."""
+    identities = sorted({m.identity for m in chronology.templates})
+    if not identities:
+        return np.zeros((camera.height, camera.width), np.int32)
+    counts = [chronology.background.count, *[m.splats.count for m in chronology.templates]]
+    owner = np.repeat([0, *[m.identity for m in chronology.templates]], counts)
+    splats = compose(chronology, t)
+    weights = np.zeros((camera.height, camera.width))
+    labels = np.zeros((camera.height, camera.width), np.int32)
+    for start in range(0, len(identities), 3):
+        chunk = identities[start : start + 3]
+        values = np.stack([owner == i for i in chunk] + [np.zeros_like(owner, bool)] * (3 - len(chunk)), axis=-1)
+        painted = eye.paint(splats, camera, values.astype(np.float32))
+        for j, identity in enumerate(chunk):
+            better = (painted[..., j] > 0.5) & (painted[..., j] > weights)
+            labels[better] = identity
+            weights = np.where(better, painted[..., j], weights)
+    return labels
+
+
+def pose_change(a: SE3, b: SE3, size: float) -> tuple[float, float]:
+    """Translation in object sizes and rotation in radians between two poses of a template."""
+    motion = a.inverse() @ b
+    moved = float(np.linalg.norm(np.asarray(motion.xyz))) / max(size, 1e-9)
+    return moved, float(rotation_angle(motion.quat / jnp.linalg.norm(motion.quat)))
+
+
+def _track(chronology: Chronology, k: int, accounts: Sequence[Sequence[Account]], run) -> dict:
+    """The entry of one object in tracks.json."""
+    template = chronology.templates[k]
+    means = np.asarray(template.splats.means)
+    low, high = np.quantile(means, [0.01, 0.99], axis=0)
+    size = float(np.linalg.norm(high - low))
+    visible = np.asarray(chronology.visible)[:, k]
+    known = {a.template: (t, a) for t, row in enumerate(accounts) for a in row}
+    states = []
+    for t in range(1, len(chronology.visits)):
+        account = next((a for a in accounts[t] if a.template == k), None) if t < len(accounts) else None
+        before, now = bool(visible[t - 1]), bool(visible[t])
+        pose = chronology.world_from_template[t, k]
+        event = "still"
+        if not now:
+            event = "removed" if before else "unseen"
+        elif not before:
+            event = "added"
+        else:
+            moved, turned = pose_change(chronology.world_from_template[t - 1, k], pose, size)
+            if account is not None and account.kind == "moved" and max(moved, turned) > _STILL:
+                event = "moved"
+        quat = np.asarray(pose.quat, float)
+        gain = account.gain if account is not None else None
+        states.append(
+            {
+                "visit": t,
+                "event": event,
+                "visible": now,
+                "world_from_template": {
+                    "wxyz": (quat / np.linalg.norm(quat)).tolist(),
+                    "xyz": np.asarray(pose.xyz, float).tolist(),
+                },
+                "confidence": round(_confidence(account), 3) if account is not None else (1.0 if known else 0.5),
+                "inliers": account.views if account is not None else 0,
+                "residual": account.residual if gain is not None else 0.0,
+                "ambiguous_axis": None,
+            }
+        )
+    return {
+        "id": template.identity,
+        "source_visit": template.source_visit,
+        "splats": template.splats.count,
+        "center": ((low + high) / 2).tolist(),
+        "size": size,
+        "states": states,
+    }
+
+
+def _confidence(account: Account) -> float:
+    """Between 0 and 1: more photographs and a larger share of the error explained."""
+    share = account.gain if account.kind == "moved" else 0.8
+    return (
+        float(np.clip(share, 0, 1) * (1 - 0.5**account.views) / (1 - 0.5**3))
+        if account.views < 3
+        else float(np.clip(share, 0, 1))
+    )

@@ -1,0 +1,399 @@
+"""The stages of `ltgs update`, in order; each leaves its result on disk and is taken up again from there."""
+
+import dataclasses
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ltgs_jax.detect import fit_tone, similarity
+from ltgs_jax.features import Classical, FrontEnd
+from ltgs_jax.fit import View, VisitView, fit_chronology, fit_initial, splats_from_points
+from ltgs_jax.geometry import SE3, Camera
+from ltgs_jax.io import (
+    CameraModel,
+    Capture,
+    InputError,
+    Photograph,
+    load_image,
+    load_mask,
+    read_bytes,
+    read_capture,
+    read_ply,
+    scaled_size,
+    write_json,
+)
+from ltgs_jax.localize import Localization, localize
+from ltgs_jax.scene import Chronology, Splats, Template
+from ltgs_jax.template import Support
+
+from .config import Config
+from .evaluate import evaluate
+from .looks import Eye, Observation
+from .outputs import never, write_outputs
+from .store import Store, digest
+from .visit import Account, State, explain_visit
+
+
+class Progress(Protocol):
+    """Where a run says how far it is."""
+
+    def stage(self, name: str) -> None: ...
+
+    def step(self, i: int, n: int, text: str = "") -> None: ...
+
+    def note(self, text: str) -> None: ...
+
+    def warn(self, text: str) -> None: ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """What every stage needs."""
+
+    capture: Capture
+    cameras: dict[str, Camera]
+    statuses: tuple[dict, ...]
+    config: Config
+    seed: int
+
+    def posed(self, visit: int, role: str) -> list[Photograph]:
+        """Photographs of a visit and role whose camera is known."""
+        return [p for p in self.capture.at(visit, role) if p.name in self.cameras]
+
+
+@contextmanager
+def _only_run(folder: Path) -> Iterator[None]:
+    """Holds the folder for this process; a second run into it is refused, a dead one's hold is taken over."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = folder / ".running"
+    try:
+        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+    except FileExistsError:
+        holder = lock.read_text().strip()
+        if holder.isdecimal() and Path(f"/proc/{holder}").exists() and int(holder) != os.getpid():
+            raise InputError(f"{folder}: another run (process {holder}) is writing there") from None
+        lock.unlink(missing_ok=True)
+        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+    os.write(handle, str(os.getpid()).encode())
+    os.close(handle)
+    try:
+        yield
+    finally:
+        lock.unlink(missing_ok=True)
+
+
+def update(
+    capture_dir: str | Path,
+    out_dir: str | Path,
+    *,
+    config: Config,
+    initial: str | Path | None = None,
+    seed: int = 0,
+    progress: Progress,
+    front_end: FrontEnd | None = None,
+) -> Chronology:
+    """Find what changed in a capture and write its chronology to `out_dir` (contract.md); run again, it resumes.
+
+    Raises InputError, one line, for what is wrong with the capture or an option.
+    """
+    out = Path(out_dir)
+    capture = read_capture(capture_dir)
+    given = Path(initial) if initial is not None else capture.initial_ply
+    scene = read_ply(given) if given is not None else None
+    front_end = front_end or Classical()
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from None
+    with _only_run(out):
+        for name, reason in capture.problems:
+            progress.warn(f"{name}: {reason}")
+        write_json(
+            out / "config.json", {**dataclasses.asdict(config), "seed": seed, "initial": str(given) if given else None}
+        )
+        write_json(out / "env.json", _environment())
+        store = Store(out, progress)
+        key = digest(
+            config, seed, [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
+        )
+        run = _locate_photographs(store, key, capture, config, seed, progress)
+        key = digest(key, run.statuses)
+        eye = Eye()
+        splats, errors = _initial_scene(store, key, run, scene, given, front_end, eye, progress)
+        state = State(Chronology.of_initial(splats, capture.visits), errors, (), ())
+        accounts: list[list[Account]] = [[]]
+        for t in range(1, len(capture.visits)):
+            key = digest(key, t)
+            state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
+            accounts.append(told)
+        chronology = _long_fit(store, digest(key, "fit"), run, state, progress)
+        write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
+        store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
+    return chronology
+
+
+def _locate_photographs(store: Store, key: str, capture: Capture, config: Config, seed: int, progress) -> Run:
+    """Cameras of all photographs, those without a pose placed against the first visit."""
+
+    def compute():
+        found: Localization = localize(
+            capture,
+            config=config.localize,
+            progress=lambda what, done, total: progress.step(done, total, what),
+        )
+        names = sorted(found.cameras)
+        arrays = {
+            "quat": np.stack([np.asarray(found.cameras[n].cam_from_world.quat) for n in names]),
+            "xyz": np.stack([np.asarray(found.cameras[n].cam_from_world.xyz) for n in names]),
+            "K": np.stack([np.asarray(found.cameras[n].K) for n in names]),
+            "size": np.asarray([[found.cameras[n].width, found.cameras[n].height] for n in names]),
+        }
+        statuses = [
+            {"name": p.name, "status": p.status, "inliers": p.inliers, "reason": p.reason} for p in found.photographs
+        ]
+        counts = {kind: sum(s["status"] == kind for s in statuses) for kind in ("given", "localized", "rejected")}
+        lenses = {name: dataclasses.asdict(lens) for name, lens in found.lenses.items()}
+        return arrays, {"names": names, "statuses": statuses, "lenses": lenses, "counts": counts}
+
+    arrays, notes = store.run("localize", key, compute)
+    cameras = {
+        name: Camera(
+            SE3(jnp.asarray(arrays["quat"][i]), jnp.asarray(arrays["xyz"][i])),
+            jnp.asarray(arrays["K"][i]),
+            int(arrays["size"][i, 0]),
+            int(arrays["size"][i, 1]),
+        )
+        for i, name in enumerate(notes["names"])
+    }
+    for status in notes["statuses"]:
+        if status["status"] == "rejected":
+            progress.warn(f"{status['name']}: left out, {status['reason']}")
+    lenses = {name: CameraModel(**{**lens, "params": tuple(lens["params"])}) for name, lens in notes["lenses"].items()}
+    photographs = tuple(
+        dataclasses.replace(p, camera=cameras.get(p.name), camera_model=lenses.get(p.name, p.camera_model))
+        for p in capture.photographs
+    )
+    capture = dataclasses.replace(capture, photographs=photographs)
+    run = Run(capture, cameras, tuple(notes["statuses"]), config, seed)
+    if not run.posed(0, "train"):
+        raise InputError(f"{capture.folder}: no photograph of the first visit has a pose")
+    return run
+
+
+def scaled_camera(camera: Camera, max_side: int | None) -> Camera:
+    """The camera at the size that photographs are worked on."""
+    return camera.resized(*scaled_size(camera.width, camera.height, max_side))
+
+
+def load_view(run: Run, photograph: Photograph) -> View:
+    """A photograph as the fit sees it."""
+    side = run.config.io.max_side
+    image = load_image(photograph, max_side=side)
+    return View(
+        scaled_camera(run.cameras[photograph.name], side),
+        np.rint(255 * image).astype(np.uint8),
+        load_mask(photograph, max_side=side),
+    )
+
+
+def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, eye: Eye, progress):
+    """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
+    config = run.config
+
+    def compute():
+        views = [load_view(run, p) for p in run.posed(0, "train")]
+        if scene is not None:
+            splats = scene
+        else:
+            if len(run.capture.points) < 4:
+                raise InputError(f"{run.capture.folder}: too few sparse points to start from; give --initial PLY")
+            start = splats_from_points(
+                run.capture.points,
+                run.capture.point_colors,
+                capacity=config.fit.initial.max_splats,
+                sh_degree=config.fit.initial.sh_degree,
+            )
+            splats = fit_initial(
+                start, views, key=jax.random.key(run.seed), config=config.fit.initial, progress=progress.step
+            ).splats
+        progress.note("measuring what difference is to be expected")
+        sample = views[:: max(1, len(views) // 12)]
+        votes = np.zeros((splats.count, 2))
+        for view in sample:
+            image = view.image.astype(np.float32) / 255
+            rendered = eye.image(splats, view.camera)
+            unlike = 1 - similarity(rendered, image, front_end, gamma=config.detect.gamma)
+            votes += eye.votes(splats, view.camera, np.stack([unlike * view.mask, view.mask], axis=-1))
+        usual = np.median(votes[:, 0].sum() / max(votes[:, 1].sum(), 1e-6))
+        errors = np.where(votes[:, 1] > 0.3, votes[:, 0] / np.maximum(votes[:, 1], 1e-6), usual)
+        return {**pack_splats("", splats), "errors": errors.astype(np.float32)}, {"counts": {"splats": splats.count}}
+
+    arrays, _ = store.run("initial", digest(key, read_bytes(given) if given else None, config.fit.initial), compute)
+    return unpack_splats("", arrays), arrays["errors"]
+
+
+_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+def pack_splats(prefix: str, splats: Splats) -> dict[str, np.ndarray]:
+    """Arrays by name."""
+    return {f"{prefix}{field}": np.asarray(getattr(splats, field)) for field in _FIELDS}
+
+
+def unpack_splats(prefix: str, arrays: dict[str, np.ndarray]) -> Splats:
+    """The splats that `pack_splats` named."""
+    return Splats(**{field: arrays[f"{prefix}{field}"] for field in _FIELDS})
+
+
+def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
+    """Explain one visit; its state on disk."""
+    config = run.config
+
+    def compute():
+        observations = []
+        for photograph in run.posed(t, "update"):
+            view = load_view(run, photograph)
+            image = view.image.astype(np.float32) / 255
+            rendered = eye.image(state.chronology.background, view.camera)
+            tone = fit_tone(image, rendered, view.mask)
+            if tone.changed:
+                progress.note(f"{photograph.name}: other light, taken out")
+            observations.append(Observation(photograph.name, view.camera, tone(image), view.mask))
+        rng = np.random.default_rng([run.seed, t])
+        after, accounts, masks = explain_visit(
+            state, t, observations, front_end, eye=eye, config=config, rng=rng, progress=progress
+        )
+        changed = float(np.mean([m.mean() for m in masks])) if masks else 0.0
+        counts = {
+            "photographs": len(observations),
+            "changed_pixels": round(changed, 5),
+            "objects": len(accounts),
+            "templates_added": len(after.chronology.templates) - len(state.chronology.templates),
+        }
+        for account in accounts:
+            identity = after.chronology.templates[account.template].identity
+            progress.note(f"{run.capture.visits[t]}: object {identity} {account.kind}")
+        return pack_state(after), {
+            **_state_notes(after),
+            "accounts": [asdict_account(a) for a in accounts],
+            "counts": counts,
+        }
+
+    arrays, notes = store.run(f"visit_{t:03d}", key, compute)
+    return unpack_state(arrays, notes, run.capture.visits), [Account(**a) for a in notes["accounts"]]
+
+
+def asdict_account(account: Account) -> dict:
+    """An account as JSON holds it."""
+    return {
+        "template": account.template,
+        "kind": account.kind,
+        "gain": float(account.gain),
+        "residual": float(account.residual),
+        "views": account.views,
+    }
+
+
+def pack_state(state: State) -> dict[str, np.ndarray]:
+    """A state as arrays by name."""
+    chronology = state.chronology
+    arrays = {
+        **pack_splats("background.", chronology.background),
+        "errors": state.errors,
+        "quat": np.asarray(chronology.world_from_template.quat),
+        "xyz": np.asarray(chronology.world_from_template.xyz),
+        "visible": np.asarray(chronology.visible),
+    }
+    for k, template in enumerate(chronology.templates):
+        arrays |= pack_splats(f"template{k}.", template.splats)
+        arrays[f"template{k}.errors"] = state.template_errors[k]
+        support = state.supports[k]
+        if support is not None:
+            arrays[f"template{k}.support"] = np.asarray([*support.normal, support.offset, support.noise])
+    return arrays
+
+
+def _state_notes(state: State) -> dict:
+    return {"templates": [[m.identity, m.source_visit] for m in state.chronology.templates]}
+
+
+def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, ...]) -> State:
+    """The state that `pack_state` named."""
+    templates, errors, supports = [], [], []
+    for k, (identity, source) in enumerate(notes["templates"]):
+        templates.append(Template(unpack_splats(f"template{k}.", arrays), identity, source))
+        errors.append(arrays[f"template{k}.errors"])
+        packed = arrays.get(f"template{k}.support")
+        supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
+    start = Chronology.of_initial(unpack_splats("background.", arrays), visits)
+    chronology = Chronology(
+        start.background,
+        tuple(templates),
+        SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"])),
+        jnp.asarray(arrays["visible"]),
+        start.exposure,
+        visits,
+    )
+    return State(chronology, arrays["errors"], tuple(errors), tuple(supports))
+
+
+def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chronology:
+    """Everything together; skipped, and said so, when nothing changed."""
+    config = run.config
+
+    def compute():
+        later = [(p, t) for t in range(1, len(run.capture.visits)) for p in run.posed(t, "update")]
+        if not state.chronology.templates or not later:
+            progress.note("nothing changed: the chronology is the initial scene")
+            return pack_state(state), {**_state_notes(state), "counts": {"steps": 0}}
+        views = [VisitView(load_view(run, p), 0) for p in run.posed(0, "train")]
+        for photograph, t in later:
+            view = load_view(run, photograph)
+            rendered = Eye().image(state.chronology.background, view.camera)
+            tone = fit_tone(view.image.astype(np.float32) / 255, rendered, view.mask)
+            image = np.rint(255 * tone(view.image.astype(np.float32) / 255)).astype(np.uint8)
+            views.append(VisitView(View(view.camera, image, view.mask), t))
+        movable = jnp.ones(state.chronology.background.count, bool)
+        chronology, losses = fit_chronology(
+            state.chronology,
+            views,
+            movable=movable,
+            key=jax.random.key(run.seed + 1),
+            config=config.fit.long,
+            progress=progress.step,
+        )
+        fitted = eqx.tree_at(lambda s: s.chronology, state, chronology)
+        return pack_state(fitted), {**_state_notes(fitted), "counts": {"steps": len(losses)}}
+
+    arrays, notes = store.run("fit", digest(key, config.fit.long), compute)
+    return unpack_state(arrays, notes, run.capture.visits).chronology
+
+
+def _environment() -> dict:
+    """Versions and device."""
+    packages = (
+        "jax",
+        "jaxlib",
+        "equinox",
+        "optimistix",
+        "optax",
+        "numpy",
+        "opencv-contrib-python-headless",
+        "pycolmap",
+    )
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "packages": {name: version(name) for name in packages},
+        "devices": [str(device) for device in jax.devices()],
+        "cores": os.cpu_count(),
+    }

@@ -1,0 +1,172 @@
+"""The main job on a small built-in capture: what it leaves, resume, and refusals."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ltgs_jax import pipeline
+from ltgs_jax.demo import make_capture
+from ltgs_jax.io import InputError, load_chronology, read_json, read_ply, read_tracks
+from ltgs_jax.pipeline.outputs import read_cameras
+from ltgs_jax.pipeline.store import Store, digest
+from ltgs_jax.render import render
+from ltgs_jax.scene import compose
+
+_TINY = pipeline.PRESETS["tiny"]
+CONFIG = replace(_TINY, fit=replace(_TINY.fit, long=replace(_TINY.fit.long, steps=12)))
+
+
+class Quiet:
+    """A reporter that remembers."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+
+    def stage(self, name: str) -> None:
+        self.lines.append(name)
+
+    def step(self, i: int, n: int, text: str = "") -> None:
+        del i, n, text
+
+    def note(self, text: str) -> None:
+        self.lines.append(text)
+
+    def warn(self, text: str) -> None:
+        self.lines.append(f"warning: {text}")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    folder = make_capture(
+        tmp_path_factory.mktemp("pipeline") / "capture",
+        scene="move",
+        seed=1,
+        width=112,
+        height=84,
+        dense=14,
+        update=3,
+        test=1,
+        points=1500,
+    )
+    for visit in ("IMG_0002", "IMG_0003"):  # two visits tell what four would
+        shutil.rmtree(folder / "images" / visit)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(capture) -> Path:
+    out = capture.parent / "out"
+    pipeline.update(capture, out, config=CONFIG, progress=Quiet())
+    return out
+
+
+def test_every_file_of_the_contract_is_there(run, capture):
+    visits = read_tracks(run / "tracks.json")["visits"]
+    for name in ("config.json", "env.json", "stages.json", "chronology.json", "chronology.safetensors", "metrics.json"):
+        assert (run / name).is_file(), name
+    for t in range(len(visits)):
+        assert (run / "splats" / f"{capture.name}_{t:04d}.ply").is_file()
+    assert not (run / ".running").exists()
+    stages = read_json(run / "stages.json", list)
+    assert [row["stage"] for row in stages][:2] == ["localize", "initial"]
+    assert all(row["status"] == "done" for row in stages)
+
+
+def test_exported_visit_renders_like_the_composed_one(run, capture):
+    chronology = load_chronology(run)
+    _, cameras = read_cameras(run)
+    _, _, camera = next(entry for name, entry in cameras.items() if name.startswith(chronology.visits[1]))
+    for t in range(len(chronology.visits)):
+        exported = render(read_ply(run / "splats" / f"{capture.name}_{t:04d}.ply"), camera).image
+        composed = render(compose(chronology, t), camera).image
+        np.testing.assert_allclose(exported, composed, atol=1e-5)
+
+
+def test_masks_and_renders_have_the_photographs_sizes(run, capture):
+    for photograph in read_json(run / "report.json")["photographs"]:
+        image = cv2.imread(str(capture / "images" / photograph["name"]))
+        rendered = cv2.imread(str(run / photograph["render_path"]))
+        assert rendered.shape == image.shape
+        if photograph["role"] == "update":
+            mask = cv2.imread(str(run / photograph["mask_path"]), cv2.IMREAD_UNCHANGED)
+            assert mask.shape == image.shape[:2]
+
+
+def test_scores_cover_later_visits_and_the_truth(run):
+    rows = read_json(run / "metrics.json", list)
+    keys = {row["key"] for row in rows}
+    assert {"psnr", "ssim", "flip", "event_f1", "mask_iou", "mask_f1"} <= keys
+    assert all(np.isfinite(row["value"]) for row in rows)
+
+
+def test_a_second_run_resumes_and_changes_nothing(run, capture):
+    before = (run / "chronology.safetensors").read_bytes()
+    progress = Quiet()
+    pipeline.update(capture, run, config=CONFIG, progress=progress)
+    assert "initial: taken from disk" in progress.lines
+    assert "fit: taken from disk" in progress.lines
+    assert (run / "chronology.safetensors").read_bytes() == before
+
+
+def test_a_stage_cut_short_is_done_again_with_the_same_result(run, capture, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    path = copy / "stages" / "fit.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+    progress = Quiet()
+    pipeline.update(capture, copy, config=CONFIG, progress=progress)
+    assert "fit: taken from disk" not in progress.lines
+    assert (copy / "chronology.safetensors").read_bytes() == (run / "chronology.safetensors").read_bytes()
+
+
+def test_render_and_export_of_a_finished_run(run, capture, tmp_path):
+    pipeline.render_visit(run, 1, None, True, tmp_path / "all")
+    assert len(list((tmp_path / "all").rglob("*.png"))) == 2
+    pipeline.export_visit(run, 0, "ply", tmp_path / "first.ply")
+    assert read_ply(tmp_path / "first.ply").count > 0
+    with pytest.raises(InputError, match=r"--camera nowhere\.png"):
+        pipeline.render_visit(run, 1, "nowhere.png", False, tmp_path)
+    with pytest.raises(InputError, match="--format jpeg"):
+        pipeline.export_visit(run, 0, "jpeg", tmp_path / "x")
+
+
+def test_a_folder_in_use_is_refused(capture, tmp_path):
+    out = tmp_path / "busy"
+    out.mkdir()
+    (out / ".running").write_text("1")
+    with pytest.raises(InputError, match="another run"):
+        pipeline.update(capture, out, config=CONFIG, progress=Quiet())
+
+
+def test_a_missing_capture_is_refused(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        pipeline.update(tmp_path / "nothing", tmp_path / "out", config=CONFIG, progress=Quiet())
+    assert not (tmp_path / "out").exists()
+
+
+def test_store_computes_once_per_key(tmp_path):
+    calls = []
+
+    def compute():
+        calls.append(1)
+        return {"a": np.arange(3)}, {"counts": {"n": 3}}
+
+    for key in ("x", "x", "y"):
+        arrays, notes = Store(tmp_path, Quiet()).run("stage", key, compute)
+        np.testing.assert_array_equal(arrays["a"], np.arange(3))
+        assert notes["counts"] == {"n": 3}
+    assert len(calls) == 2
+    rows = json.loads((tmp_path / "stages.json").read_text())
+    assert rows[0]["stage"] == "stage"
+
+
+def test_digest_tells_contents_apart():
+    assert digest(np.zeros(2)) != digest(np.zeros(3))
+    assert digest(jnp.zeros(2)) == digest(jnp.zeros(2))
+    assert digest(CONFIG) != digest(pipeline.PRESETS["fast"])
