@@ -1,7 +1,11 @@
 """The viewer: what it sends, what its controls do, and, where there is Chromium, what a person sees."""
 
 import json
+import signal
+import subprocess
+import sys
 import time
+import urllib.request
 
 import jax.numpy as jnp
 import numpy as np
@@ -189,6 +193,22 @@ def test_a_broken_chronology_is_named(folder):
     (folder / "chronology.safetensors").write_bytes(b"short")
     with pytest.raises(InputError, match=r"chronology\.safetensors"):
         start(folder, port=18080)
+
+
+def test_the_command_serves_until_it_is_interrupted(folder):
+    program = "import sys; from ltgs_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", program, "view", str(folder), "--port", "18090"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    try:
+        line = next(line for line in process.stdout if line.startswith("http://"))
+        with urllib.request.urlopen(line.split()[0], timeout=60) as page:
+            assert page.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+        assert "Traceback" not in process.stderr.read()
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def _wait_for_client(viewer):

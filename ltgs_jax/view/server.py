@@ -1,5 +1,6 @@
 """The viewer: a local web server whose page shows a chronology, with a slider over visits."""
 
+import contextlib
 import threading
 import time
 from pathlib import Path
@@ -25,11 +26,10 @@ def serve(folder: str | Path, *, host: str = "localhost", port: int = 8080) -> N
     """
     viewer = start(folder, host=host, port=port)
     print(f"http://{host}:{viewer.server.get_port()}  (Ctrl-C ends)", flush=True)
-    try:
+    with contextlib.suppress(KeyboardInterrupt):
         while True:
             time.sleep(3600)
-    finally:
-        viewer.server.stop()
+    viewer.server.stop()
 
 
 def start(folder: str | Path, *, host: str = "localhost", port: int = 8080) -> "Viewer":
