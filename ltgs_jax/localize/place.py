@@ -12,6 +12,7 @@ from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import CameraModel, Capture, InputError, Photograph, load_image, load_mask
 
 from .affine import Keypoints, affine_keypoints
+from .align import Alignment, RenderView, align_photograph
 from .map import FrozenMap, View, extend_map
 from .pose import PoseEstimate, estimate_pose, find_candidates, grow_pose, with_focal
 from .retrieval import global_descriptor, most_alike
@@ -19,6 +20,8 @@ from .types import Localization, LocalizeConfig, PhotographStatus
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is done, how many are done, of how many)."""
+
+_STARTS = 4  # renders to align a photograph with: the poses of so many photographs that look like it
 
 
 @dataclasses.dataclass
@@ -33,17 +36,25 @@ class _Pending:
     tilted: Keypoints | None
     look: Float[np.ndarray, " d"]
     estimate: PoseEstimate | None = None
+    aligned: Alignment | None = None
 
 
 def localize(
-    capture: Capture, *, config: LocalizeConfig | None = None, progress: Progress | None = None
+    capture: Capture,
+    *,
+    config: LocalizeConfig | None = None,
+    progress: Progress | None = None,
+    render_view: RenderView | None = None,
 ) -> Localization:
     """Cameras of all photographs of a capture that can be placed (section 3.1 of the paper; gate of hloc's users).
 
     Photographs with a pose keep it and form the frozen map: their keypoints, matched along epipolar lines and
     triangulated. The others are placed by SIFT matches, RANSAC and growth along the prediction (`estimate_pose`); a
     later photograph that was placed joins the map, so that a visit's photographs help each other. `unused` photographs
-    are left alone, `test` ones placed but never part of the map. Returns at once when every pose is given.
+    are left alone, `test` ones placed but never part of the map. Returns at once when every pose is given. With
+    `render_view` (of the initial scene, `splat_view`) a later photograph that features cannot place is aligned with
+    renders from the poses of the photographs most like it (`align_photograph`); its inliers are then the patches that
+    agree.
 
     Raises InputError when no photograph of the first visit has a pose.
     """
@@ -59,6 +70,9 @@ def localize(
         for pending in _place_all(capture, known, unplaced, config, report):
             name = pending.photograph.name
             reason = _gate(pending.estimate, known, config)
+            if reason is not None and render_view is not None and pending.photograph.visit > 0:
+                report("alignment with renders", 0, 1)
+                reason = _align(pending, known, config, render_view) and reason
             status[name] = _found_status(pending, reason)
             if reason is None:
                 lenses[name] = _found_lens(pending)
@@ -229,6 +243,21 @@ def _polish(placed: list[_Pending], frozen: FrozenMap, config: LocalizeConfig) -
         q.estimate = grown or q.estimate
 
 
+def _align(pending: _Pending, known: list[Photograph], config: LocalizeConfig, render_view: RenderView) -> str | None:
+    """Place a photograph by alignment with renders; None when that is believed, else why not."""
+    looks = np.stack([global_descriptor(load_image(p, max_side=160)) for p in known])
+    nearest = [known[i] for i in most_alike(pending.look, looks, _STARTS)]
+    starts = [np.asarray(p.camera.cam_from_world.as_matrix(), np.float64)[:3] for p in nearest]
+    image = load_image(pending.photograph, max_side=config.max_side)
+    found = align_photograph(image, pending.K, starts, render_view)
+    if found is None or found.agreeing < max(config.min_inliers, 0.5 * found.textured):
+        return "alignment with renders does not agree"
+    if _too_far(-found.cam_from_world[:, :3].T @ found.cam_from_world[:, 3], known, config) is not None:
+        return "alignment with renders leads too far away"
+    pending.aligned = found
+    return None
+
+
 def _gate(estimate: PoseEstimate | None, known: list[Photograph], config: LocalizeConfig) -> str | None:
     """Why a pose is not believed; None when it is."""
     if estimate is None:
@@ -237,9 +266,14 @@ def _gate(estimate: PoseEstimate | None, known: list[Photograph], config: Locali
         return f"only {estimate.inliers} of its keypoints agree with one pose, {config.min_inliers} are needed"
     if estimate.ratio < config.min_ratio:
         return f"only {estimate.ratio:.1%} of its matches agree with one pose, {config.min_ratio:.0%} are needed"
+    return _too_far(estimate.center(), known, config)
+
+
+def _too_far(center: Float[np.ndarray, "3"], known: list[Photograph], config: LocalizeConfig) -> str | None:
+    """Why a place cannot be: it lies many extents of the known cameras away."""
     centers = np.stack([np.asarray(p.camera.center()) for p in known])
     extent = np.linalg.norm(np.ptp(centers, axis=0))
-    distance = np.linalg.norm(estimate.center() - centers.mean(axis=0))
+    distance = np.linalg.norm(center - centers.mean(axis=0))
     if extent > 0 and distance > config.max_extent * extent:
         return f"its place is {distance / extent:.0f} times the extent of the known cameras away"
     return None
@@ -254,6 +288,8 @@ def _given_status(capture: Capture, index: int) -> PhotographStatus:
 def _found_status(pending: _Pending, reason: str | None) -> PhotographStatus:
     """What became of a photograph that was looked for."""
     estimate, photograph = pending.estimate, pending.photograph
+    if pending.aligned is not None:
+        return PhotographStatus(photograph.name, "localized", pending.aligned.agreeing, None, None)
     inliers = 0 if estimate is None else estimate.inliers
     residual = None if estimate is None else estimate.residual * photograph.width / pending.size[0]
     return PhotographStatus(photograph.name, "rejected" if reason else "localized", inliers, residual, reason)
@@ -271,5 +307,6 @@ def _found_lens(pending: _Pending) -> CameraModel:
 
 def _found_camera(pending: _Pending, lens: CameraModel) -> Camera:
     """The pinhole camera of a photograph that was placed, float32 as those that `io` reads."""
-    pose = SE3.from_matrix(np.concatenate([pending.estimate.cam_from_world, [[0.0, 0, 0, 1]]]).astype(np.float32))
+    found = pending.estimate if pending.aligned is None else pending.aligned
+    pose = SE3.from_matrix(np.concatenate([found.cam_from_world, [[0.0, 0, 0, 1]]]).astype(np.float32))
     return lens.camera(SE3(jnp.asarray(pose.quat), jnp.asarray(pose.xyz)))
