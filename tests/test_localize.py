@@ -34,7 +34,12 @@ def _look_at(center, target):
 
 
 def _render(pose, focal=_FOCAL, size=_SIZE, textures=None):
-    """The floor z = 0 and the wall y = 2, both within [-2, 2], by intersecting rays."""
+    """The image alone of `_cast`."""
+    return _cast(pose, focal, size, textures)[0]
+
+
+def _cast(pose, focal, size, textures):
+    """Image and depth of the floor z = 0 and the wall y = 2, both within [-2, 2], by intersecting rays."""
     floor, wall = textures or (_texture(1), _texture(2))
     width, height = size
     x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
@@ -55,7 +60,7 @@ def _render(pose, focal=_FOCAL, size=_SIZE, textures=None):
             borderMode=cv2.BORDER_REPLICATE,
         )
         image[on], nearest[on] = colour[on], depth[on]
-    return np.repeat(image[..., None], 3, axis=-1)
+    return np.repeat(image[..., None], 3, axis=-1), nearest
 
 
 def _quat(rotation):
@@ -186,6 +191,31 @@ def test_retrieval_bounds_the_map(tmp_path, scene):
     result = localize(capture, config=config, progress=lambda what, done, total: totals.setdefault(what, total))
     assert totals["keypoints of the map"] <= 6
     assert sum(s.status == "localized" for s in result.photographs) == 3
+
+
+def test_what_features_cannot_place_is_aligned_with_renders(tmp_path):
+    textures = tuple(cv2.GaussianBlur(_texture(seed), (0, 0), 6) for seed in (1, 2))
+    textures = tuple(cv2.normalize(texture, None, 40, 220, cv2.NORM_MINMAX) for texture in textures)
+    scene = {}
+    for i, angle in enumerate((-0.4, -0.2, 0.0, 0.2, 0.4)):
+        pose = _look_at([3.2 * np.sin(angle), -2.6 * np.cos(angle), 1.7 + 0.1 * (i % 3)], [0, 0.6, 0.3])
+        scene[f"a/{i}.png"] = (_render(pose, textures=textures), pose, _FOCAL)
+    near = _look_at([0.05, -2.6, 1.85], [0.03, 0.62, 0.3])
+    scene["b/0.png"] = (_render(near, textures=textures), near, _FOCAL)
+    capture = read_capture(_write(tmp_path, scene, given={name for name in scene if name[0] == "a"}))
+
+    def view(camera):
+        pose = np.asarray(camera.cam_from_world.as_matrix(), np.float64)[:3]
+        image, depth = _cast(pose, float(camera.K[0, 0]), (camera.width, camera.height), textures)
+        covered = np.isfinite(depth)
+        return image.astype(np.float32) / 255, np.where(covered, depth, 0), covered.astype(np.float32)
+
+    config = LocalizeConfig(tilts=(), min_ratio=2.0)  # a ratio that no feature matches reach
+    assert localize(capture, config=config).photographs[-1].status == "rejected"
+    result = localize(capture, config=config, render_view=view)
+    assert result.photographs[-1].status == "localized" and result.photographs[-1].inliers >= 20
+    degrees, distance = _error(result.cameras["b/0.png"], near)
+    assert degrees < 0.5 and distance < 0.05
 
 
 def test_no_known_camera_is_an_input_error(tmp_path, scene):
