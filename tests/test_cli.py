@@ -1,5 +1,6 @@
 """The `ltgs` command: options, exit statuses, one-line messages. The pipeline is a stand-in that records its calls."""
 
+import inspect
 import io
 import os
 import re
@@ -135,8 +136,19 @@ def test_an_option_of_a_room_goes_before_the_preset_wherever_it_stands(pipeline)
 )
 def test_wrong_options_are_named_on_one_line(pipeline, capsys, words, named):
     assert main(words.split()) == 2
-    assert named in _one_line_error(capsys)
+    error = _one_line_error(capsys)
+    assert named in error and "helptext" not in error
     assert not pipeline.calls
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_messages_come_through_any_encoding(encoding):
+    program = "import sys; from ltgs_jax.cli import main; sys.exit(main(['view', 'here', '--port', 'many']))"
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment, timeout=60)
+    assert done.returncode == 2
+    said = done.stderr.decode().splitlines()
+    assert len(said) == 1 and said[0].startswith("ltgs: Error parsing --port: invalid literal"), said
 
 
 def test_a_narrow_terminal_changes_nothing(pipeline, capsys, monkeypatch):
@@ -312,6 +324,18 @@ def test_the_demo_makes_its_capture_once(pipeline, tmp_path, monkeypatch, capsys
     capsys.readouterr()
     assert main(["demo", "--out", str(tmp_path), "--scene", "light"]) == 2
     assert "another" in _one_line_error(capsys)
+
+
+def test_the_real_pipeline_takes_what_the_commands_give():
+    from ltgs_jax import pipeline
+
+    for preset, config in pipeline.PRESETS.items():
+        assert parse(["update", "in", "--out", "o", "--preset", preset]).config == config
+    options = {"config": config, "initial": None, "seed": 0, "progress": LineReporter(io.StringIO())}
+    inspect.signature(pipeline.update).bind(Path("in"), Path("out"), **options)
+    inspect.signature(pipeline.evaluate).bind(Path("out"), None)
+    inspect.signature(pipeline.render_visit).bind(Path("out"), 1, None, True, Path("folder"))
+    inspect.signature(pipeline.export_visit).bind(Path("out"), 1, "ply", Path("file"))
 
 
 def test_the_documents_name_commands_and_options_that_exist(pipeline, capsys):

@@ -164,12 +164,14 @@ def _parse(record: type[Parsed], args: Sequence[str], *, prog: str, **options) -
 
 
 def _one_line(box: str) -> str:
-    """The message in tyro's box, up to the rule that comes before its hints."""
-    words: list[str] = []
+    """The message in what tyro says: the first part of its box; after the title where it draws no box, for ASCII."""
+    parts: list[list[str]] = [[]]
     for line in box.splitlines():
-        inside = re.sub(r"^\W*[│╭╰]|[│╮╯]\W*$", "", line).strip()
-        if re.fullmatch(r"─{3,}", inside) and words:
-            break
-        if inside and "─" not in inside:
-            words.append(inside)
-    return " ".join(words) or "the options cannot be read"
+        words = line.strip(" │")
+        if re.match(r"[╭╰]|[─-]{3,}$", words):
+            parts.append([])
+        elif words:
+            parts[-1].append(words)
+    told = [" ".join(words) for words in parts if words]
+    message = told[0 if "│" in box else 1] if len(told) > ("│" not in box) else " ".join(told)
+    return message.split(" For full helptext")[0] or "the options cannot be read"
