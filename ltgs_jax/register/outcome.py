@@ -38,6 +38,12 @@ class RegisterConfig(eqx.Module):
     """Bounds of the Geman-McClure annealing of each hypothesis, in units of the noise bound."""
     refine_steps: int = eqx.field(static=True, default=8)
     """Reweighted closed-form steps of each finalist."""
+    bound_factors: tuple[float, ...] = eqx.field(static=True, default=(1.0, 2.0, 0.5, 4.0, 0.25))
+    """Factors of the noise bound that are tried in turn until one settles the matter."""
+    settle: float = eqx.field(static=True, default=0.95)
+    """Confidence at which no further bound is tried."""
+    approach_steps: int = eqx.field(static=True, default=20)
+    """Reweighted Gauss-Newton steps of the winner before the final solve."""
     max_steps: int = eqx.field(static=True, default=64)
     """Levenberg-Marquardt steps of the final solve."""
     min_confidence: float = eqx.field(static=True, default=0.5)

@@ -9,18 +9,13 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ltgs_jax.geometry import SE3
 
 from .align import squared_residuals
-from .hypotheses import Hypotheses, Problem, polish, rescore, search
+from .consensus import confidence_against, find_consensus, find_second, vote
+from .hypotheses import Problem
 from .outcome import RegisterConfig, Registration, Result
-from .refine import BOUND_IN_SIGMA, final_solve, free_axis, information, inlier_probability
-from .verdict import confidence_against, null_score
+from .refine import BOUND_IN_SIGMA, approach, final_solve, free_axis, information, inlier_probability
 
 # Sizes to which concrete inputs are padded, so that compilation is rare.
 _PADDED = (32, 64, 128, 256, 512, 1024, 2048, 4096, 8192)
-
-
-def _choose(hypotheses: Hypotheses) -> tuple[SE3, Float[Array, ""]]:
-    best = jnp.argmax(hypotheses.score)
-    return hypotheses.motion[best], hypotheses.score[best]
 
 
 def _normalize(src, dst, weights, noise_bound):
@@ -44,8 +39,8 @@ def _solve(src, dst, weights, covariances, noise_bound, key, config) -> Registra
         jnp.where(finite[:, None], src, 0), jnp.where(finite[:, None], dst, 0), weights, noise_bound
     )
     frozen = jax.lax.stop_gradient(problem)
-    found = search(frozen, config)
-    start, score = _choose(polish(found, frozen, config))
+    consensus = find_consensus(frozen, key, config)
+    problem, frozen = problem.at_bound(consensus.bound), frozen.at_bound(consensus.bound)
 
     eye = jnp.eye(3, dtype=src.dtype)
     sigma = problem.bound / BOUND_IN_SIGMA
@@ -54,6 +49,7 @@ def _solve(src, dst, weights, covariances, noise_bound, key, config) -> Registra
     else:
         factor = jnp.linalg.cholesky(jnp.where(finite[:, None, None], covariances / size**2, eye))
         whitener = jax.scipy.linalg.solve_triangular(factor, jnp.broadcast_to(eye, factor.shape), lower=True)
+    start = approach(consensus.motion, frozen, jax.lax.stop_gradient(whitener), config.approach_steps)
     motion, converged = final_solve(start, problem, whitener, config)
 
     residuals = motion.apply(problem.src) - problem.dst
@@ -65,18 +61,17 @@ def _solve(src, dst, weights, covariances, noise_bound, key, config) -> Registra
     usable = jnp.sum(weights > 0)
     info = information(motion, problem, whitener, probability * weights)
 
-    strongest = jnp.maximum(jnp.max(weights), jnp.finfo(src.dtype).tiny)
-    null = null_score(frozen, config, key)
-    confidence = jnp.where(usable >= 3, confidence_against(score / strongest, null / strongest), 0)
+    unit = vote(problem)
+    confidence = jnp.where(usable >= 3, confidence_against(consensus.score, consensus.null, unit), 0)
     result = jnp.where(converged, int(Result.SUCCESS), int(Result.NOT_CONVERGED))
     result = jnp.where(confidence < config.min_confidence, int(Result.NO_CONSENSUS), result)
     result = jnp.where(usable < 3, int(Result.TOO_FEW_POINTS), result)
 
-    rest = eqx.tree_at(lambda p: p.weights, frozen, jnp.where(inlier, 0, weights))
-    second, second_score = _choose(polish(rescore(found, rest), rest, config))
+    remaining = jnp.where(inlier, 0, weights)
+    second, second_score = find_second(consensus, frozen, remaining, config)
     second_squared = squared_residuals(second.rotmat()[None], second.xyz[None], problem.src, problem.dst)[0]
-    second_count = jnp.sum((second_squared < problem.bound**2) & (rest.weights > 0))
-    second_confidence = confidence_against(second_score / strongest, null / strongest)
+    second_count = jnp.sum((second_squared < problem.bound**2) & (remaining > 0))
+    second_confidence = confidence_against(second_score, consensus.null, unit)
     second_count = jnp.where(second_confidence > config.min_confidence, second_count, 0)
 
     def world(local: SE3) -> SE3:
