@@ -96,7 +96,9 @@ def _local_weights(seeds: Int[Array, " s"], second: Float[Array, "s n"]) -> Floa
     return local.at[jnp.arange(seeds.size), seeds].set(strongest)
 
 
-def _score(squared: Float[Array, "s n"], problem: Problem) -> Float[Array, " s"]:
+def score(motion: SE3, problem: Problem) -> Float[Array, " s"]:
+    """Truncated least squares as a count, Σ w·max(1 − r²/bound², 0), of each motion."""
+    squared = squared_residuals(motion.rotmat(), motion.xyz, problem.src, problem.dst)
     return jnp.sum(problem.weights * jnp.maximum(1 - squared / problem.bound**2, 0), axis=1)
 
 
@@ -109,8 +111,7 @@ def reweighted(motion: SE3, problem: Problem, moments: Float[Array, "n 16"], fac
 
 def rescore(motion: SE3, problem: Problem) -> Hypotheses:
     """Motions with their scores on a weighting of the correspondences."""
-    squared = squared_residuals(motion.rotmat(), motion.xyz, problem.src, problem.dst)
-    return Hypotheses(motion, _score(squared, problem))
+    return Hypotheses(motion, score(motion, problem))
 
 
 def search(problem: Problem, config: RegisterConfig) -> Hypotheses:

@@ -40,26 +40,31 @@ class RegisterConfig(eqx.Module):
     """Reweighted closed-form steps of each finalist."""
     bound_factors: tuple[float, ...] = eqx.field(static=True, default=(1.0, 2.0, 0.5, 4.0, 0.25))
     """Factors of the noise bound that are tried in turn until one settles the matter."""
-    settle: float = eqx.field(static=True, default=0.95)
-    """Confidence at which no further bound is tried."""
+    settle: float = eqx.field(static=True, default=5.0)
+    """Score above the null, in units of the null's spread, at which no further bound is tried."""
     approach_steps: int = eqx.field(static=True, default=20)
     """Reweighted Gauss-Newton steps of the winner before the final solve."""
     max_steps: int = eqx.field(static=True, default=64)
     """Levenberg-Marquardt steps of the final solve."""
-    min_confidence: float = eqx.field(static=True, default=0.5)
-    """Confidence under which the answer is called NO_CONSENSUS."""
+    min_distinction: float = eqx.field(static=True, default=1.5)
+    """Score above the null, in units of the null's spread, under which the answer is called NO_CONSENSUS."""
     ambiguous_ratio: float = eqx.field(static=True, default=0.02)
-    """Least ratio of the two smallest moments of inertia of the inliers at which a rotation counts as fixed."""
+    """Variance of the inliers across their longest axis, as a share of that along it, under which a rotation about it
+    is free."""
+    estimate_scale: bool = eqx.field(static=True, default=False)
+    """Whether `dst` may be a scaled copy: dst = scale·R·src + t."""
 
 
 class Registration(eqx.Module):
     """The answer of `register`.
 
     `dst_from_src` SE(3), the best motion found even when `result` names a failure (the identity without 3 usable
-    points); `inlier_weights` [n] in [0, 1]; `inliers` how many residuals lie under the noise bound; `residual` their
-    root mean square, in the unit of the points; `covariance` [6 6] of the tangent (v, ω) at `dst_from_src`, right
-    perturbation; `result` a code of `Result`; `confidence` in [0, 1]; `ambiguous_axis` a unit vector in the frame of
-    `src` about which the rotation is not fixed, zero where there is none; `second` the next motion that other
+    points); `scale` 1 unless it was asked for. `inlier_weights` [n] in [0, 1]; `inliers` how many residuals lie under
+    `noise_bound`, the bound that was used in the end; `residual` their root mean square, in the unit of the points.
+    `covariance` [6 6] of the tangent (v, ω) at `dst_from_src`, right perturbation. `result` a code of `Result`;
+    `confidence` in [0, 1] that the answer is within 5° and 5 % of the diameter; `distinction` how far the consensus
+    stands above that of permuted correspondences, in units of its spread. `ambiguous_axis` a unit vector in the frame
+    of `src` about which the rotation is not fixed, zero where there is none. `second` the next motion that other
     correspondences agree on, with their count `second_inliers` (0 where chance explains it).
     """
 
@@ -67,9 +72,12 @@ class Registration(eqx.Module):
     inlier_weights: Float[Array, " n"]
     inliers: Int[Array, ""]
     residual: Float[Array, ""]
+    scale: Float[Array, ""]
     covariance: Float[Array, "6 6"]
     result: Int[Array, ""]
     confidence: Float[Array, ""]
+    distinction: Float[Array, ""]
+    noise_bound: Float[Array, ""]
     ambiguous_axis: Float[Array, "3"]
     second: SE3
     second_inliers: Int[Array, ""]

@@ -43,6 +43,12 @@ def whitened_residuals(motion: SE3, problem: Problem, whitener: Float[Array, "n 
     return jnp.einsum("nij,nj->ni", whitener, residuals, precision=Precision.HIGHEST)
 
 
+def isotropic_whitener(problem: Problem) -> Float[Array, "n 3 3"]:
+    """Whitener of equal noise in all directions, whose 99 % bound is the noise bound."""
+    eye = jnp.eye(3, dtype=problem.src.dtype) * (BOUND_IN_SIGMA / problem.bound)
+    return jnp.broadcast_to(eye, (*problem.weights.shape, 3, 3))
+
+
 def approach(start: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], steps: int) -> SE3:
     """Reweighted Gauss-Newton steps in closed 6×6 form: cheap, and precise where a cost is rounded away."""
     weights = problem.weights
@@ -113,14 +119,3 @@ def information(
     """JᵀWJ of the whitened residuals at the motion, for the tangent (v, ω)."""
     jacobian = tangent_jacobian(motion, problem, whitener)
     return jnp.einsum("n,nij,nik->jk", weights, jacobian, jacobian, precision=Precision.HIGHEST)
-
-
-def free_axis(information_matrix: Float[Array, "6 6"], config: RegisterConfig) -> Float[Array, "3"]:
-    """Unit axis, in the frame of `src`, about which the inliers do not fix the rotation; zero where they do."""
-    a, b, c = information_matrix[:3, :3], information_matrix[:3, 3:], information_matrix[3:, 3:]
-    scale = jnp.trace(a)
-    a = a + jnp.finfo(a.dtype).eps * jnp.maximum(scale, jnp.finfo(a.dtype).tiny) * jnp.eye(3, dtype=a.dtype)
-    rotation = c - jnp.matmul(b.T, jnp.linalg.solve(a, b), precision=Precision.HIGHEST)
-    values, vectors = jnp.linalg.eigh(0.5 * (rotation + rotation.T))
-    free = (values[0] < config.ambiguous_ratio * values[1]) & (values[1] > 0)
-    return jnp.where(free, vectors[:, 0], 0)
