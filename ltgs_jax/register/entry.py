@@ -42,7 +42,7 @@ def register(
     weights: Float[Array, " n"] | np.ndarray | None = None,
     covariances: Float[Array, "..."] | np.ndarray | None = None,
     key: PRNGKeyArray | None = None,
-    config: RegisterConfig = RegisterConfig(),  # noqa: B008 (frozen)
+    config: RegisterConfig = RegisterConfig(),
 ) -> Registration:
     """The rigid motion from `src` to `dst`, row i of one believed to be row i of the other, most of them wrongly.
 

@@ -32,7 +32,7 @@ def _centre(points: Float[Array, "n 3"], usable: Float[Array, " n"]) -> Float[Ar
 
 
 def _prepare(src, dst, weights, noise_bound) -> tuple[Problem, Float[Array, "3"], Float[Array, "3"], Float[Array, ""]]:
-    """Drop unusable rows, centre both sets and scale them by the size of `dst`; also both centres and the size."""
+    """Drop unusable rows, centre both sets and scale them by the size of `src`; also both centres and the size."""
     finite = jnp.isfinite(src).all(-1) & jnp.isfinite(dst).all(-1) & jnp.isfinite(weights)
     weights = jnp.where(finite, jnp.maximum(weights, 0), 0)
     usable = (weights > 0).astype(src.dtype)
