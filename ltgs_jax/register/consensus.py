@@ -15,8 +15,8 @@ from .outcome import RegisterConfig
 _COMPARED = (1.0, 2.0, 4.0)
 # Any two correspondences that keep their distance agree on a motion, and a third agrees with them soon.
 _LEAST_NULL = 2.5
-# Distinction by which another bound must beat the one before: the null's own luck is worth 1.4.
-_CHANGE = 1.5
+# Distinction by which another bound must beat the one before: the null has its own luck.
+_CHANGE = 1.0
 # Share of the best distinction from which a finalist counts as a rival of the best.
 _RIVAL = 0.6
 # Spread of the best chance score over permutations: a share of it and a part of a vote (measured, N = 20 to 1000).

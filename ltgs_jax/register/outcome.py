@@ -30,7 +30,7 @@ class Result(enum.IntEnum):
 class RegisterConfig(eqx.Module):
     """Options of `register`; all static."""
 
-    seeds: int = eqx.field(static=True, default=256)
+    seeds: int = eqx.field(static=True, default=512)
     """Most correspondences around which a local consensus set is grown."""
     finalists: int = eqx.field(static=True, default=16)
     """Hypotheses that are refined on all correspondences before one is chosen."""
