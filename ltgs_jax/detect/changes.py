@@ -30,6 +30,8 @@ class DetectConfig:
     """Pixels by which masks are dilated before they are used as outlines."""
     guessed: float = 0.3
     """Dissimilarity to be expected where the scene's colours are guesses, under something that left."""
+    unexplained: float = 0.4
+    """Expected dissimilarity from which on the initial scene says nothing: no photograph showed it well enough."""
     everywhere: float = 0.6
     """Share of changed pixels from which a photograph is said to be changed everywhere."""
 
@@ -58,17 +60,20 @@ def change_map(
     1 − similarity, less what the scene's own fit lets `expected`, in units of the unchanged pixels' robust deviation;
     binarised by Otsu, but never below `config.sigmas`, and only where the part above is a class of its own.
     """
+    # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
+    captured = np.where(valid[..., None], captured, rendered)
     difference = 1 - similarity(rendered, captured, front_end, gamma=config.gamma)
     excess = difference - expected
-    inside = excess[valid]
+    known = valid & (expected < config.unexplained)
+    inside = excess[known]
     if len(inside) < 64:
         return ChangeMap(np.zeros_like(excess), np.zeros_like(valid), np.inf, False)
     middle = np.median(inside)
     deviation = 1.4826 * np.median(np.abs(inside - middle)) + 0.01
-    score = np.where(valid, (excess - middle) / deviation, 0).astype(np.float32)
-    clipped = np.clip(score[valid], 0, 4 * config.sigmas)
+    score = np.where(known, (excess - middle) / deviation, 0).astype(np.float32)
+    clipped = np.clip(score[known], 0, 4 * config.sigmas)
     threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
-    mask = valid & (score > threshold)
+    mask = known & (score > threshold)
     mask = clean(mask, config.min_area)
     two_classes = bool(mask.any())
     return ChangeMap(score, mask, threshold, two_classes)

@@ -233,8 +233,8 @@ def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, ey
             rendered = eye.image(splats, view.camera)
             unlike = 1 - similarity(rendered, image, front_end, gamma=config.detect.gamma)
             votes += eye.votes(splats, view.camera, np.stack([unlike * view.mask, view.mask], axis=-1))
-        usual = np.median(votes[:, 0].sum() / max(votes[:, 1].sum(), 1e-6))
-        errors = np.where(votes[:, 1] > 0.3, votes[:, 0] / np.maximum(votes[:, 1], 1e-6), usual)
+        # A prior of two pixels that disagree by half: what the photographs hardly showed is not to be relied on.
+        errors = (votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)
         return {**pack_splats("", splats), "errors": errors.astype(np.float32)}, {"counts": {"splats": splats.count}}
 
     arrays, _ = store.run("initial", digest(key, read_bytes(given) if given else None, config.fit.initial), compute)

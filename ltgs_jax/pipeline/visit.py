@@ -330,8 +330,9 @@ def _place(state, t, gone, instances, cones, observations, evidence, surface, ey
         if i not in crops:
             continue
         template, gain = _settle_new(template, crops[i], config)
-        if gain < config.template.tau_new:
-            progress.note(f"visit {t}: arrival {i} left out, as an object it explains only {gain:.2f} of the change")
+        # More than the change itself: it improves what did not change, and is no account of what did.
+        if not config.template.tau_new <= gain <= 1.3:
+            progress.note(f"visit {t}: arrival {i} left out, as an object it explains {gain:.2f} of the change")
             continue
         errors = np.full(template.splats.count, 0.5 * config.detect.guessed, state.errors.dtype)
         state = _add_template(state, template, errors, supports[i], t)
