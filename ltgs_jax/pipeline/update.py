@@ -178,11 +178,7 @@ def _locate_photographs(store: Store, key: str, capture: Capture, config: Config
         if status["status"] == "rejected":
             progress.warn(f"{status['name']}: left out, {status['reason']}")
     lenses = {name: CameraModel(**{**lens, "params": tuple(lens["params"])}) for name, lens in notes["lenses"].items()}
-    photographs = tuple(
-        dataclasses.replace(p, camera=cameras.get(p.name), camera_model=lenses.get(p.name, p.camera_model))
-        for p in capture.photographs
-    )
-    capture = dataclasses.replace(capture, photographs=photographs)
+    capture = Localization(cameras, lenses, ()).apply(capture)
     run = Run(capture, cameras, tuple(notes["statuses"]), config, seed)
     if not run.posed(0, "train"):
         raise InputError(f"{capture.folder}: no photograph of the first visit has a pose")
