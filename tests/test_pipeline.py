@@ -1,5 +1,6 @@
 """The main job on a small built-in capture: what it leaves, resume, and refusals."""
 
+import importlib
 import json
 import shutil
 from dataclasses import replace
@@ -12,7 +13,7 @@ import pytest
 
 from ltgs_jax import pipeline
 from ltgs_jax.demo import make_capture
-from ltgs_jax.io import InputError, load_chronology, read_json, read_ply, read_tracks
+from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
 from ltgs_jax.render import render
@@ -170,3 +171,23 @@ def test_digest_tells_contents_apart():
     assert digest(np.zeros(2)) != digest(np.zeros(3))
     assert digest(jnp.zeros(2)) == digest(jnp.zeros(2))
     assert digest(CONFIG) != digest(pipeline.PRESETS["fast"])
+
+
+def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
+    copy = tmp_path / "capture"
+    shutil.copytree(capture, copy)
+    photographs = sorted((copy / "images" / "IMG_0001").glob("*.png"))
+    update_stage = importlib.import_module("ltgs_jax.pipeline.update")
+    whole = read_capture(copy)
+    run = update_stage.Run(whole, {p.name: p.camera for p in whole.photographs}, (), CONFIG, 0)
+    used = run.posed(1, "update")
+    damaged = next(path for path in photographs if used[0].name.endswith(path.name))
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 200] = bytes(200)
+    damaged.write_bytes(content)
+    progress = Quiet()
+    views = update_stage.load_views(run, used, progress)
+    assert [p.name for p, _ in views] == [p.name for p in used[1:]]
+    assert any(used[0].name in line and line.startswith("warning") for line in progress.lines)
+    with pytest.raises(InputError, match="none of the photographs"):
+        update_stage.load_views(run, used[:1], progress)

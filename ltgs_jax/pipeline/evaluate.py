@@ -49,7 +49,10 @@ def evaluate(out_dir: str | Path, capture_dir: str | Path | None) -> list[dict]:
         sums: dict[tuple[str, str], list[float]] = {}
         for entry in shown:
             photograph = photographs[entry["name"]]
-            image, mask = load_image(photograph), load_mask(photograph)
+            try:
+                image, mask = load_image(photograph), load_mask(photograph)
+            except InputError:  # named when the run tried to use it
+                continue
             if image.shape[:2] != (cameras[photograph.name][2].height, cameras[photograph.name][2].width):
                 raise InputError(f"{photograph.path}: its size is not that of its camera in {out / 'cameras.json'}")
             rendered = load_render(out / entry["render_path"], image.shape)

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import platform
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -201,12 +201,27 @@ def load_view(run: Run, photograph: Photograph) -> View:
     )
 
 
+def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, View]]:
+    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error."""
+    views = []
+    for photograph in photographs:
+        try:
+            views.append((photograph, load_view(run, photograph)))
+        except InputError as error:
+            progress.warn(f"{photograph.name}: left out, {error}")
+    if photographs and not views:
+        raise InputError(
+            f"{run.capture.folder}: none of the photographs of {photographs[0].name.split('/')[0]} is usable"
+        )
+    return views
+
+
 def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, eye: Eye, progress):
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
     config = run.config
 
     def compute():
-        views = [load_view(run, p) for p in run.posed(0, "train")]
+        views = [view for _, view in load_views(run, run.posed(0, "train"), progress)]
         if scene is not None:
             splats = scene
         else:
@@ -256,8 +271,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
 
     def compute():
         observations = []
-        for photograph in run.posed(t, "update"):
-            view = load_view(run, photograph)
+        for photograph, view in load_views(run, run.posed(t, "update"), progress):
             image = view.image.astype(np.float32) / 255
             rendered = eye.image(state.chronology.background, view.camera)
             tone = fit_tone(image, rendered, view.mask)
@@ -347,13 +361,13 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
     config = run.config
 
     def compute():
-        later = [(p, t) for t in range(1, len(run.capture.visits)) for p in run.posed(t, "update")]
+        visits = range(1, len(run.capture.visits))
+        later = [(p, view, t) for t in visits for p, view in load_views(run, run.posed(t, "update"), progress)]
         if not state.chronology.templates or not later:
             progress.note("nothing changed: the chronology is the initial scene")
             return pack_state(state), {**_state_notes(state), "counts": {"steps": 0}}
-        views = [VisitView(load_view(run, p), 0) for p in run.posed(0, "train")]
-        for photograph, t in later:
-            view = load_view(run, photograph)
+        views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
+        for _, view, t in later:
             rendered = Eye().image(state.chronology.background, view.camera)
             tone = fit_tone(view.image.astype(np.float32) / 255, rendered, view.mask)
             image = np.rint(255 * tone(view.image.astype(np.float32) / 255)).astype(np.uint8)

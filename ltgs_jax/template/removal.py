@@ -69,9 +69,10 @@ def find_removed(
         if lifted is None:
             continue
         members, support = lifted
-        views = int(np.sum(changed[:, members].sum(axis=1) >= least))
-        if views >= (1 if support is not None else 2):
-            removals.append(Removal(members, support, float(left[members].sum()), views))
+        views, votes = int(np.sum(changed[:, members].sum(axis=1) >= least)), float(left[members].sum())
+        # One photograph alone may only have something in front of it: it must show more, and solid ground below.
+        if views >= 2 or (views == 1 and support is not None and votes >= 3 * least):
+            removals.append(Removal(members, support, votes, views))
     return sorted(removals, key=lambda r: -r.votes)
 
 
