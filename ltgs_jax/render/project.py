@@ -40,7 +40,7 @@ class Projected(eqx.Module):
 
 def _bounded(x: Float[Array, "n ..."], largest: float = _LARGEST) -> Bool[Array, " n"]:
     """Whether all entries of each row are numbers of usable size (false for NaN)."""
-    return jnp.all(jnp.abs(x).reshape(x.shape[0], -1) <= largest, axis=-1)
+    return jnp.all(jnp.abs(x) <= largest, axis=tuple(range(1, x.ndim)))
 
 
 def _choose(mask: Bool[Array, " n"], x: Float[Array, "n ..."], other: float) -> Float[Array, "n ..."]:
@@ -93,6 +93,9 @@ def project_splats(
 
     camera = jax.tree.map(lambda x: jnp.where(camera_usable, x, jnp.ones_like(x)).astype(dtype), camera)
     means, quats = _choose(usable, splats.means, 0), _choose(usable, splats.quats, 1)
+    # The reciprocal of a quaternion near float32's largest number would be flushed to 0.
+    huge = jnp.max(jnp.abs(quats), axis=-1, keepdims=True) > _LARGEST
+    quats = quats * jnp.where(huge, 1 / _LARGEST, 1).astype(dtype)
     scales = jnp.exp(_choose(usable, splats.log_scales, 0))
     opacities = jax.nn.sigmoid(_choose(usable, splats.logit_opacities, 0))
     values = _choose(usable, values, 0)
