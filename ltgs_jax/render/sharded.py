@@ -1,7 +1,7 @@
 """A batch of cameras over several devices."""
 
 import jax
-from jax.sharding import Mesh
+from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Float
 
@@ -40,6 +40,8 @@ def render_sharded(
     if plan is None:
         plan = plan_render(*jax.lax.stop_gradient((splats, cameras)), config=config, slack=1)
     (axis,) = mesh.axis_names
+    # An explicitly typed mesh would ask the caller to place every argument first.
+    mesh = Mesh(mesh.devices, mesh.axis_names, axis_types=(AxisType.Auto,))
 
     def one_device(splats, cameras, background, colors):
         output = render(splats, cameras, background=background, plan=plan, colors=colors, config=config)
