@@ -196,7 +196,9 @@ def test_a_broken_chronology_is_named(folder):
 
 
 def test_the_command_serves_until_it_is_interrupted(folder):
-    program = "import sys; from ltgs_jax.cli import main; sys.exit(main(sys.argv[1:]))"
+    # A shell's background job ignores SIGINT, and its children with it; a terminal's does not.
+    heed = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    program = heed + "import sys; from ltgs_jax.cli import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", program, "view", str(folder), "--port", "18090"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

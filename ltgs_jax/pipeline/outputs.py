@@ -218,9 +218,4 @@ def _track(chronology: Chronology, k: int, accounts: Sequence[Sequence[Account]]
 
 def _confidence(account: Account) -> float:
     """Between 0 and 1: more photographs and a larger share of the error explained."""
-    share = account.gain if account.kind == "moved" else 0.8
-    return (
-        float(np.clip(share, 0, 1) * (1 - 0.5**account.views) / (1 - 0.5**3))
-        if account.views < 3
-        else float(np.clip(share, 0, 1))
-    )
+    return float(np.clip(account.gain, 0, 1) * (1 - 0.5 ** min(account.views, 3)) / (1 - 0.5**3))

@@ -162,7 +162,7 @@ def explain_visit(
     progress.note(f"visit {t}: {len(gone)} left their place, {len(instances)} came")
     state, accounts = _place(state, t, gone, instances, cones, observations, after, surface, eye, config, rng, progress)
     placed = {a.template for a in accounts}
-    accounts += [Account(k, "removed", 1.0, 0.0, len(observations)) for k in gone if k not in placed]
+    accounts += [Account(k, "removed", gone[k], 0.0, len(observations)) for k in gone if k not in placed]
     return state, accounts, coarse
 
 
@@ -176,7 +176,7 @@ def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evid
     seen, changed = np.stack(seen), np.stack(changed)
     pixels = int(np.mean([o.valid.size for o in observations]))
     cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
-    gone = []
+    gone: dict[int, float] = {}  # template: share of what the photographs see of it that changed
     for k in range(len(state.chronology.templates)):
         mine = owner == k + 1
         total = seen[:, mine].sum(axis=1)
@@ -184,7 +184,7 @@ def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evid
         if mine.any() and visible.any():
             share = changed[:, mine].sum(axis=1)[visible] / total[visible]
             if share.min() > 0.5 or np.average(share, weights=total[visible]) > 0.6:
-                gone.append(k)
+                gone[k] = float(np.average(share, weights=total[visible]))
                 state = _set_from(state, t, k, visible=False)
     base = owner == 0
     background = state.chronology.background
@@ -204,7 +204,8 @@ def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evid
         state = _add_template(state, template, state.errors[members], removal.support, 0)
         k = len(state.chronology.templates) - 1
         state = _set_from(state, t, k, visible=False)
-        gone.append(k)
+        mine = np.flatnonzero(base)[members]
+        gone[k] = float(changed[:, mine].sum() / max(seen[:, mine].sum(), 1e-9))
         if removal.support is not None:
             points = np.asarray(background.means, np.float64)[members]
             fills.append((points, removal.support))
