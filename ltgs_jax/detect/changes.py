@@ -20,8 +20,6 @@ class DetectConfig:
 
     gamma: float = 0.7
     """γ, the share of semantic cosine against SSIM."""
-    tau_iou: float = 0.65
-    """τ_IoU: share of a proposed region that must be changed for it to be taken whole."""
     sigmas: float = 5.0
     """A difference counts from this many robust standard deviations of the unchanged pixels on."""
     min_area: float = 4e-4
@@ -32,8 +30,6 @@ class DetectConfig:
     """Dissimilarity to be expected where the scene's colours are guesses, under something that left."""
     unexplained: float = 0.4
     """Expected dissimilarity from which on the initial scene says nothing: no photograph showed it well enough."""
-    everywhere: float = 0.6
-    """Share of changed pixels from which a photograph is said to be changed everywhere."""
 
 
 class ChangeMap(eqx.Module):

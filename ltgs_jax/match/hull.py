@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy import ndimage
 
 
 class Cone(eqx.Module):
@@ -60,13 +59,3 @@ def carve(points: Float[np.ndarray, "n 3"], cones: Sequence[Cone], *, tolerance:
         counts[:, 0] += seen & on
         counts[:, 1] += seen & ~on
     return counts
-
-
-def label_solid(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "x y z"]:
-    """Connected components (26 neighbours) of occupied voxels; 0 is empty."""
-    return ndimage.label(solid, structure=np.ones((3, 3, 3)))[0]
-
-
-def surface(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
-    """Occupied voxels with an empty face neighbour."""
-    return solid & ~ndimage.binary_erosion(solid)

@@ -24,10 +24,6 @@ class MatchConfig:
     """Start of a ray, as a share of the depth of the known surface behind."""
     min_new: float = 0.3
     """Share of an instance's silhouette pixels that no larger instance explains, in at least one photograph."""
-    tau_cos: float = 0.9
-    """τ_cos: pooled descriptors of one object agree at least this well across visits."""
-    tau_match: int = 50
-    """τ_match: dense matches that alone join two masks of one visit."""
 
 
 class Instance(eqx.Module):

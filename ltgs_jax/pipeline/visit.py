@@ -11,7 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ltgs_jax.detect import change_map, dilate
 from ltgs_jax.features import FrontEnd
-from ltgs_jax.fit import Windows, fit_local
+from ltgs_jax.fit import Windows, fit_local, template_diameter
 from ltgs_jax.geometry import SE3
 from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats
@@ -275,7 +275,7 @@ def _place(state, t, gone, instances, cones, observations, evidence, surface, ey
         searches = {}
         for k in hidden:
             stood_on, template = state.supports[k], state.chronology.templates[k]
-            size = _diameter(template.splats)
+            size = template_diameter(template.splats)
             if stood_on is not None and _sizes_agree(instance, size):
                 place = np.median(instance.points, axis=0)
                 searches[k] = search_template(
@@ -284,7 +284,7 @@ def _place(state, t, gone, instances, cones, observations, evidence, surface, ey
         for k in sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]:
             template = state.chronology.templates[k]
             placement = settle_template(
-                searches[k], support, crop, size=_diameter(template.splats), refiner=eye.refiner
+                searches[k], support, crop, size=template_diameter(template.splats), refiner=eye.refiner
             )
             progress.note(
                 f"visit {t}: arrival {i} as object {template.identity}: explains {placement.gain:.2f}, "
@@ -344,7 +344,7 @@ def _place(state, t, gone, instances, cones, observations, evidence, surface, ey
 def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float]:
     """A new object after a short fit in its windows, and the share of the change that it explains; what the photographs
     do not support fades and is dropped. A change too faint to be an object explains nothing."""
-    size = _diameter(template.splats)
+    size = template_diameter(template.splats)
     padded = pad_splats(template.splats, multiple=config.template.new_splats)
     windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
     splats, losses = fit_local(padded, windows, size=size, steps=config.template.new_steps)
@@ -356,11 +356,6 @@ def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Templat
         return template, 0.0
     gain = (without - float(losses[-5:].mean())) / max(change, 1e-9)
     return eqx.tree_at(lambda m: m.splats, template, splats[keep]), gain
-
-
-def _diameter(splats: Splats) -> float:
-    low, high = np.quantile(np.asarray(splats.means), [0.01, 0.99], axis=0)
-    return float(np.linalg.norm(high - low))
 
 
 def _sizes_agree(instance: Instance, size: float) -> bool:

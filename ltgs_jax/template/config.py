@@ -37,5 +37,3 @@ class TemplateConfig:
     """Share of the photometric error that a known template must explain to be taken for what came."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that lies on what changed."""
-    tau_overlap: float = 0.15
-    """τ_overlap: largest Chamfer distance of two aligned templates, in units of their size."""

@@ -3,7 +3,7 @@
 import numpy as np
 import scipy.sparse as sparse
 import scipy.sparse.linalg as sparse_linalg
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 
@@ -47,10 +47,3 @@ def components(means: Float[np.ndarray, "n 3"], radius: float) -> Int[np.ndarray
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     return rank[labels]
-
-
-def inside_views(
-    keep: Bool[np.ndarray, " n"], votes: Float[np.ndarray, "n 2"], *, slack: float = 0.0
-) -> Bool[np.ndarray, " n"]:
-    """Majority label of FlashSplat: kept where the votes inside the object's masks outweigh those outside."""
-    return keep & (votes[:, 0] >= (1 + slack) * votes[:, 1])
