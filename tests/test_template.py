@@ -162,8 +162,8 @@ def test_a_template_is_found_where_it_stands_now():
     crop = _crop(turned, 40)
     config = TemplateConfig(search_splats=512)
     place = np.array([0.1, 0.1, 0.15])
-    search = search_template(template, support, support, place, crop, size=0.42, config=config)
-    placement = settle_template(search, support, crop, size=0.42, refiner=Refiner())
+    search = search_template(template, support, support, place, crop, size=0.42, refiner=Refiner(), rng=rng, config=config)
+    placement = settle_template(search, crop, size=0.42, refiner=Refiner())
     error = placement.world_from_template.inverse() @ truth
     assert placement.gain > 0.8
     assert placement.overlap > 0.8

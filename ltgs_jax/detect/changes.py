@@ -13,6 +13,9 @@ from ltgs_jax.features import FrontEnd
 
 from .similarity import similarity
 
+_LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise and resampling
+_COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
+
 
 @dataclass(frozen=True)
 class DetectConfig:
@@ -33,10 +36,15 @@ class DetectConfig:
 
 
 class ChangeMap(eqx.Module):
-    """`score` in robust standard deviations above expectation; `mask` the pixels past the threshold; the threshold;
-    `two_classes` whether Otsu's split is one (False: the mask is empty, nothing changed)."""
+    """What one photograph says of change.
+
+    `score` in robust standard deviations above expectation; `evidence` in −1…1, −1 where the pixel is as expected, 1
+    where it changed, 0 where it cannot be told; `mask` the pixels that changed; `threshold` on the score;
+    `two_classes` whether the split is one (False: the mask is empty, nothing changed).
+    """
 
     score: Float[np.ndarray, "h w"]
+    evidence: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
     threshold: float
     two_classes: bool
@@ -51,28 +59,69 @@ def change_map(
     *,
     config: DetectConfig = DetectConfig(),
 ) -> ChangeMap:
-    """Coarse change mask of one photograph.
+    """Change mask of one photograph.
 
-    1 − similarity, less what the scene's own fit lets `expected`, in units of the unchanged pixels' robust deviation;
-    binarised by Otsu, but never below `config.sigmas`, and only where the part above is a class of its own.
+    1 − similarity, less what the scene's own fit lets `expected`, in units of the deviation that unchanged pixels of
+    the same expectation show; binarised by Otsu, but never below `config.sigmas`, and only where the part above is a
+    class of its own. Descriptors reach several pixels beyond what changed: the outline is that of the colours.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
     captured = np.where(valid[..., None], captured, rendered)
-    difference = 1 - similarity(rendered, captured, front_end, gamma=config.gamma)
-    excess = difference - expected
     known = valid & (expected < config.unexplained)
-    inside = excess[known]
-    if len(inside) < 64:
-        return ChangeMap(np.zeros_like(excess), np.zeros_like(valid), np.inf, False)
-    middle = np.median(inside)
-    deviation = 1.4826 * np.median(np.abs(inside - middle)) + 0.01
-    score = np.where(known, (excess - middle) / deviation, 0).astype(np.float32)
+    if known.sum() < 64:
+        nothing = np.zeros_like(expected, dtype=np.float32)
+        return ChangeMap(nothing, nothing, np.zeros_like(valid), np.inf, False)
+    difference = 1 - similarity(rendered, captured, front_end, gamma=config.gamma)
+    score = _standardize(difference - expected, expected, known, floor=0.01)
     clipped = np.clip(score[known], 0, 4 * config.sigmas)
     threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
-    mask = known & (score > threshold)
-    mask = clean(mask, config.min_area)
-    two_classes = bool(mask.any())
-    return ChangeMap(score, mask, threshold, two_classes)
+    coarse = clean(known & (score > threshold), config.min_area)
+    colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005)
+    mask = _sharpen(coarse, known & (colours > config.sigmas), config)
+    evidence = np.where(known & ~coarse, np.clip(2 * score / threshold, 0, 1) - 1, mask.astype(np.float32))
+    return ChangeMap(score, evidence.astype(np.float32), mask, threshold, bool(mask.any()))
+
+
+def _standardize(
+    value: Float[np.ndarray, "h w"], expected: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], *, floor: float
+) -> Float[np.ndarray, "h w"]:
+    """`value` in robust deviations above its usual level, 0 where not `known`.
+
+    Level and deviation grow in proportion to `expected`: what the scene explains badly differs more, and differs more
+    widely. The two factors are medians over bins of equal expectation, so that neither a large change nor a large
+    blurred background decides them alone.
+    """
+    scale = expected + _LEAST_EXPECTED
+    ratio = (value / scale)[known]
+    order = np.argsort(expected[known], kind="stable")
+    bins = np.array_split(order, int(np.clip(len(order) // 400, 1, 12)))
+    level = np.median([np.median(ratio[b]) for b in bins])
+    spread = np.median([1.4826 * np.median(np.abs(ratio[b] - level)) for b in bins])
+    return np.where(known, (value - level * scale) / (spread * scale + floor), 0).astype(np.float32)
+
+
+def _colour_difference(
+    rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w"]:
+    """Mean absolute difference of the colours, the smallest over shifts of the render by up to a pixel."""
+    captured = cv2.GaussianBlur(captured, (0, 0), 0.7)
+    padded = cv2.copyMakeBorder(cv2.GaussianBlur(rendered, (0, 0), 0.7), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    h, w = captured.shape[:2]
+    shifted = [np.abs(padded[y : y + h, x : x + w] - captured).mean(axis=-1) for y in range(3) for x in range(3)]
+    return np.min(shifted, axis=0)
+
+
+def _sharpen(
+    coarse: Bool[np.ndarray, "h w"], fine: Bool[np.ndarray, "h w"], config: DetectConfig
+) -> Bool[np.ndarray, "h w"]:
+    """Each coarse region cut to where colours differ too, closed and filled; whole where they hardly do (texture)."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    closed = cv2.morphologyEx((fine & coarse).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
+    closed = clean(ndimage.binary_fill_holes(closed) & coarse, config.min_area)
+    labels, count = ndimage.label(coarse, np.ones((3, 3)))
+    area = np.bincount(labels.ravel(), minlength=count + 1)
+    share = np.bincount(labels.ravel(), closed.ravel(), minlength=count + 1) / np.maximum(area, 1)
+    return np.where((share > _COLOURLESS)[labels], closed, coarse)
 
 
 def clean(mask: Bool[np.ndarray, "h w"], min_area: float) -> Bool[np.ndarray, "h w"]:

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
-from ltgs_jax.detect import change_map, dilate
+from ltgs_jax.detect import ChangeMap, change_map, dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
 from ltgs_jax.geometry import SE3
@@ -23,6 +24,7 @@ from ltgs_jax.template import (
     color_from_photographs,
     fill_under,
     find_removed,
+    gone_evidence,
     make_crop,
     search_template,
     settle_template,
@@ -109,20 +111,35 @@ def _with_background(state: State, background: Splats, errors: np.ndarray) -> St
     return eqx.tree_at(lambda s: (s.chronology.background, s.errors), state, (background, errors))
 
 
+def _extend_template(state: State, k: int, splats: Splats, errors: np.ndarray) -> State:
+    """More splats, in world coordinates, for a template whose frame is the world's."""
+    joined = concatenate_splats([state.chronology.templates[k].splats, splats])
+    return eqx.tree_at(
+        lambda s: (s.chronology.templates[k].splats, s.template_errors[k]),
+        state,
+        (on_host(joined), np.concatenate([state.template_errors[k], errors])),
+    )
+
+
 class _Evidence(eqx.Module):
-    """Looks at the scene and the change masks of every photograph."""
+    """Looks at the scene, and what every photograph says of change."""
 
     looks: tuple[Look, ...]
-    masks: tuple[Bool[np.ndarray, "h w"], ...]
+    changes: tuple[ChangeMap, ...]
+
+    @property
+    def masks(self) -> list[Bool[np.ndarray, "h w"]]:
+        """The pixels of each photograph that changed."""
+        return [change.mask for change in self.changes]
 
 
 def _compare(eye: Eye, splats, errors, observations: Sequence[Observation], front_end, config: Config) -> _Evidence:
     looks = [eye.look(splats, o.camera, errors) for o in observations]
-    masks = [
-        change_map(look.image, o.image, look.expected, o.valid, front_end, config=config.detect).mask
+    changes = [
+        change_map(look.image, o.image, look.expected, o.valid, front_end, config=config.detect)
         for look, o in zip(looks, observations, strict=True)
     ]
-    return _Evidence(tuple(looks), tuple(masks))
+    return _Evidence(tuple(looks), tuple(changes))
 
 
 def explain_visit(
@@ -144,12 +161,18 @@ def explain_visit(
     """
     splats, errors, owner = _scene(state, t)
     before = _compare(eye, splats, errors, observations, front_end, config)
-    coarse = list(before.masks)
+    coarse = before.masks
     if not any(mask.any() for mask in coarse):
         return state, [], coarse
-    state, gone = _take_out(state, t, splats, owner, observations, before, eye, config, rng)
-    splats, errors, _ = _scene(state, t)
-    after = _compare(eye, splats, errors, observations, front_end, config)
+    after, gone = before, {}
+    # Twice: with the bulk of an object gone, what the first cut left of it stands out.
+    for _ in range(2):
+        background = state.chronology.background
+        state, gone = _take_out(state, t, gone, splats, owner, observations, after, eye, config, rng)
+        splats, errors, owner = _scene(state, t)
+        after = _compare(eye, splats, errors, observations, front_end, config)
+        if state.chronology.background is background:
+            break
     silhouettes = [
         dilate(mask, config.detect.dilate) & o.valid for mask, o in zip(after.masks, observations, strict=True)
     ]
@@ -166,30 +189,30 @@ def explain_visit(
     return state, accounts, coarse
 
 
-def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evidence, eye: Eye, config: Config, rng):
-    """Hide the templates and cut out the background objects that the photographs say have left."""
-    seen, changed = [], []
-    for o, mask in zip(observations, evidence.masks, strict=True):
-        votes = eye.votes(splats, o.camera, np.stack([o.valid, mask & o.valid], axis=-1))
-        seen.append(votes[:, 0])
-        changed.append(votes[:, 1])
-    seen, changed = np.stack(seen), np.stack(changed)
+def _take_out(state: State, t: int, gone, splats, owner, observations, evidence: _Evidence, eye: Eye, config, rng):
+    """Hide the templates and cut out the background objects that the photographs say have left.
+
+    `gone`: what left before in this visit, by template: the share of its evidence that says so. A remnant of one of
+    these joins it.
+    """
+    gone = dict(gone)
+    votes = [
+        eye.votes(splats, o.camera, np.stack([o.valid, change.evidence * o.valid], axis=-1))
+        for o, change in zip(observations, evidence.changes, strict=True)
+    ]
+    seen, told = np.stack([v[:, 0] for v in votes]), np.stack([v[:, 1] for v in votes])
     pixels = int(np.mean([o.valid.size for o in observations]))
     cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
-    gone: dict[int, float] = {}  # template: share of what the photographs see of it that changed
     for k in range(len(state.chronology.templates)):
         mine = owner == k + 1
-        total = seen[:, mine].sum(axis=1)
-        visible = total > config.template.min_pixels * pixels
-        if mine.any() and visible.any():
-            share = changed[:, mine].sum(axis=1)[visible] / total[visible]
-            if share.min() > 0.5 or np.average(share, weights=total[visible]) > 0.6:
-                gone[k] = float(np.average(share, weights=total[visible]))
-                state = _set_from(state, t, k, visible=False)
+        left, stayed = gone_evidence(seen[:, mine], told[:, mine])
+        if left.sum() > max(stayed.sum(), config.template.min_pixels * pixels):
+            gone[k] = float(left.sum() / (left.sum() + stayed.sum()))
+            state = _set_from(state, t, k, visible=False)
     base = owner == 0
     background = state.chronology.background
     removals = find_removed(
-        splats[base], seen[:, base], changed[:, base], cameras, pixels=pixels, rng=rng, config=config.template
+        splats[base], seen[:, base], told[:, base], cameras, pixels=pixels, rng=rng, config=config.template
     )
     taken = np.zeros(background.count, bool)
     fills = []
@@ -198,14 +221,18 @@ def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evid
         if members.sum() < 8:
             continue
         taken |= members
-        template = Template(
-            background[members], 1 + max([m.identity for m in state.chronology.templates], default=0), 0
-        )
-        state = _add_template(state, template, state.errors[members], removal.support, 0)
-        k = len(state.chronology.templates) - 1
-        state = _set_from(state, t, k, visible=False)
+        k = _torn_from(state, background[members], gone, t)
+        if k is None:
+            identity = 1 + max([m.identity for m in state.chronology.templates], default=0)
+            template = Template(background[members], identity, 0)
+            state = _add_template(state, template, state.errors[members], removal.support, 0)
+            k = len(state.chronology.templates) - 1
+            state = _set_from(state, t, k, visible=False)
+        else:
+            state = _extend_template(state, k, background[members], state.errors[members])
         mine = np.flatnonzero(base)[members]
-        gone[k] = float(changed[:, mine].sum() / max(seen[:, mine].sum(), 1e-9))
+        left, stayed = gone_evidence(seen[:, mine], told[:, mine])
+        gone[k] = float(left.sum() / (left.sum() + stayed.sum()))
         if removal.support is not None:
             points = np.asarray(background.means, np.float64)[members]
             fills.append((points, removal.support))
@@ -225,6 +252,23 @@ def _take_out(state: State, t: int, splats, owner, observations, evidence: _Evid
         # Its colours are guesses: only a strong difference there says that something came.
         state = _with_background(state, concatenate_splats([rest, *new]), np.concatenate([errors, guess]))
     return state, gone
+
+
+def _torn_from(state: State, piece: Splats, gone, t: int) -> int | None:
+    """The template, cut out at this visit, that a smaller piece beside it belongs to."""
+    means = np.asarray(piece.means)
+    for k in gone:
+        template = state.chronology.templates[k]
+        if template.source_visit != 0 or bool(np.asarray(state.chronology.visible)[t:, k].any()):
+            continue
+        pose = state.chronology.world_from_template[t, k]
+        if np.abs(np.asarray(pose.xyz)).max() > 0 or piece.count > template.splats.count:
+            continue
+        size = template_diameter(template.splats)
+        distance = cKDTree(np.asarray(template.splats.means)).query(means)[0]
+        if np.median(distance) < 0.2 * size and np.linalg.norm(np.ptp(means, axis=0)) < size:
+            return k
+    return None
 
 
 def _window(instance: Instance, observations, extra: Sequence[np.ndarray] = ()) -> list[tuple[float, float, float]]:
@@ -279,17 +323,26 @@ def _place(state, t, gone, instances, cones, observations, evidence, surface, ey
             if stood_on is not None and _sizes_agree(instance, size):
                 place = np.median(instance.points, axis=0)
                 searches[k] = search_template(
-                    template, stood_on, support, place, crop, size=size, config=config.template
+                    template,
+                    stood_on,
+                    support,
+                    place,
+                    crop,
+                    size=size,
+                    refiner=eye.refiner,
+                    rng=rng,
+                    before=state.chronology.world_from_template[t - 1, k],
+                    config=config.template,
                 )
         for k in sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]:
             template = state.chronology.templates[k]
             placement = settle_template(
-                searches[k], support, crop, size=template_diameter(template.splats), refiner=eye.refiner
+                searches[k], crop, size=template_diameter(template.splats), refiner=eye.refiner
             )
             progress.note(
                 f"visit {t}: arrival {i} as object {template.identity}: explains {placement.gain:.2f}, "
                 f"overlaps {placement.overlap:.2f} "
-                f"(points {searches[k].best_gain:.2f})"
+                f"(search {searches[k].best_gain:.2f})"
             )
             placements[i, k] = placement
     cost = np.zeros((len(instances), len(hidden) + len(instances)))

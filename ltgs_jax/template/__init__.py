@@ -14,5 +14,6 @@ from .locate import backdrop_error as backdrop_error
 from .locate import make_crop as make_crop
 from .removal import Removal as Removal
 from .removal import find_removed as find_removed
+from .removal import gone_evidence as gone_evidence
 from .support import Support as Support
 from .support import fit_support as fit_support

@@ -11,6 +11,8 @@ class TemplateConfig:
     """Smallest evidence for an object, as a share of a photograph's pixels."""
     flat: float = 3.0
     """What rises above its support by less than this many times the support's noise is no object."""
+    cut_color: float = 0.5
+    """Colour difference, in 0…1, at which two near splats are hardly taken to be of one object."""
     fill_splats: int = 2500
     """Most splats laid where an object's removal bares the surface below."""
     hull_resolution: int = 40
@@ -25,14 +27,18 @@ class TemplateConfig:
     """Steps of the short fit of a new object, before its template is used."""
     new_opacity: float = 0.1
     """Opacity a new object's splats start with (the paper's)."""
-    yaw_steps: int = 24
+    yaw_steps: int = 16
     """Turns about the support's normal tried for a known template."""
+    starts: int = 6
+    """Poses, unlike each other, that are followed further."""
     window: int = 56
     """Pixels along the edge of the windows in which poses are compared."""
     candidates: int = 2
     """Known templates, best by points, whose pose is refined for one arrival."""
     search_splats: int = 1024
     """Splats of a template while its pose is sought."""
+    tau_search: float = 0.25
+    """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
     tau_gain: float = 0.4
     """Share of the photometric error that a known template must explain to be taken for what came."""
     tau_outline: float = 0.75

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from ltgs_jax.geometry import C0
@@ -11,6 +11,9 @@ from ltgs_jax.scene import Splats
 from .config import TemplateConfig
 from .cut import components, neighbour_graph, random_walk
 from .support import Support, convex_footprint, fit_support
+
+_LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
+_MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 
 
 class Removal(eqx.Module):
@@ -24,23 +27,22 @@ class Removal(eqx.Module):
 
 
 def gone_evidence(
-    seen: Float[np.ndarray, "v n"], changed: Float[np.ndarray, "v n"], *, least_votes: float = 0.3
+    seen: Float[np.ndarray, "v n"], evidence: Float[np.ndarray, "v n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Evidence that each splat left, and that it stayed, in pixels.
 
-    A splat left only if *every* photograph that sees it (by its votes αT) shows change there: what merely hides it in
-    one photograph does not in another.
+    `seen` Σ αT per photograph, `evidence` Σ αT·e of the photograph's evidence e in −1…1. What is unchanged in one
+    photograph counts twice: something that came hides a splat in one photograph, and not in the others.
     """
-    share = np.where(seen > least_votes, changed / np.maximum(seen, 1e-9), 1.0)
-    least = share.min(axis=0)
-    total = np.where((seen > least_votes).any(axis=0), seen.sum(axis=0), 0)
-    return total * np.clip(2 * least - 1, 0, 1), total * np.clip(1 - 2 * least, 0, 1)
+    mean = np.where(seen > _LEAST_VOTES, evidence / np.maximum(seen, 1e-9), 0)
+    total = np.sum(np.minimum(seen, _MOST_VOTES) * np.where(mean < 0, 2 * mean, mean), axis=0)
+    return np.maximum(total, 0), np.maximum(-total, 0)
 
 
 def find_removed(
     splats: Splats,
     seen: Float[np.ndarray, "v n"],
-    changed: Float[np.ndarray, "v n"],
+    evidence: Float[np.ndarray, "v n"],
     cameras: Float[np.ndarray, "v 3"],
     *,
     pixels: int,
@@ -49,34 +51,34 @@ def find_removed(
 ) -> list[Removal]:
     """Cut out what left, one `Removal` for each solid thing, largest first.
 
-    Evidence from the votes spreads over a graph of near and like splats to the sides that no photograph saw; what does
-    not rise above its support (a shadow, the ground under something new) is no object.
+    Splats with evidence of having left are grouped; around each group, above the surface it stands on, the evidence
+    spreads over a graph of near splats to the sides that no photograph saw. What does not rise above its support (a
+    shadow, the ground under something new) is no object.
     """
-    left, stayed = gone_evidence(seen, changed)
+    left, stayed = gone_evidence(seen, evidence)
+    changed = np.maximum(evidence, 0)
     least = config.min_pixels * pixels
     if left.sum() < least:
         return []
     means = np.asarray(splats.means, np.float64)
     colors = np.asarray(splats.sh[:, 0]) * C0 + 0.5
-    graph = neighbour_graph(means, colors)
-    probability = random_walk(graph, np.minimum(left, 5), np.minimum(stayed, 5))
-    members = np.flatnonzero((probability > 0.5) & (stayed <= left))
-    removals = []
-    for group in _groups(means, members):
+    removals, taken = [], np.zeros(len(means), bool)
+    for group in sorted(_groups(means, np.flatnonzero(left > 0.5)), key=lambda g: -left[g].sum()):
+        group = group[~taken[group]]
         if left[group].sum() < least:
             continue
-        lifted = _lift(means, group, left, stayed, cameras, rng, config)
-        if lifted is None:
-            continue
-        members, support = lifted
-        views, votes = int(np.sum(changed[:, members].sum(axis=1) >= least)), float(left[members].sum())
-        # One photograph alone may only have something in front of it: it must show more, and solid ground below.
-        if views >= 2 or (views == 1 and support is not None and votes >= 3 * least):
-            removals.append(Removal(members, support, votes, views))
+        for members, support in _solids(means, colors, group, left, stayed, cameras, rng, config):
+            members = members & ~taken
+            votes = float(left[members].sum())
+            views = int(np.sum(changed[:, members].sum(axis=1) >= least))
+            # One photograph alone may only have something in front of it: it must show more, and solid ground below.
+            if votes >= least and (views >= 2 or (views == 1 and support is not None and votes >= 3 * least)):
+                removals.append(Removal(members, support, votes, views))
+                taken |= members
     return sorted(removals, key=lambda r: -r.votes)
 
 
-def _groups(means: Float[np.ndarray, "n 3"], members: np.ndarray, reach: float = 3.0) -> list[np.ndarray]:
+def _groups(means: Float[np.ndarray, "n 3"], members: Int[np.ndarray, " m"], reach: float = 3.0) -> list[np.ndarray]:
     """Members nearer to each other than `reach` times their usual distance."""
     if len(members) < 8:
         return []
@@ -85,30 +87,44 @@ def _groups(means: Float[np.ndarray, "n 3"], members: np.ndarray, reach: float =
     return [members[labels == i] for i in range(labels.max() + 1) if (labels == i).sum() >= 8]
 
 
-def _lift(means, group, left, stayed, cameras, rng, config: TemplateConfig):
-    """One group without the surface it stands on, and with the unseen splats that stand among it."""
-    center = means[group].mean(axis=0)
+def _solids(means, colors, group, left, stayed, cameras, rng, config: TemplateConfig):
+    """The solid things in one group: masks of splats, with what is under them on the surface they stand on."""
+    center = np.median(means[group], axis=0)
     radius = np.linalg.norm(means[group] - center, axis=1).max() + 1e-9
     near = np.linalg.norm(means - center, axis=1) < 3 * radius
     ground = near & (stayed > 0.5)
     support = fit_support(means[ground], np.minimum(stayed[ground], 5) + 1e-3, means[group], cameras, rng=rng)
-    members = np.zeros(len(means), bool)
     if support is None:
+        members = np.zeros(len(means), bool)
         members[group] = True
-        return members, None
+        return [(members, None)]
     height = support.height(means)
     top = np.quantile(height[group], 0.95)
     floor = max(config.flat * support.noise, 0.05 * top)
-    if top < floor * 1.5 or np.sum(left[group] * (height[group] > floor)) < 0.2 * left[group].sum():
-        return None
     body = group[height[group] > floor]
-    axes = support.frame()[:2]
-    # What is under the body goes with it, its contact with the support included: the fill replaces that.
-    inside = near & (height > -floor) & (height < 1.1 * top) & (stayed <= left)
-    index = np.flatnonzero(inside)
-    flat = means[body] @ axes.T
-    footprint = (flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0)
-    index = index[convex_footprint(footprint, means[index] @ axes.T)]
-    members[body] = True
-    members[index] = True
-    return members, support
+    if top < floor * 1.5 or left[body].sum() < 0.2 * left[group].sum():
+        return []
+    local = np.flatnonzero(near & (height > floor))
+    graph = neighbour_graph(means[local], colors[local], color_scale=config.cut_color)
+    # Capped, so that a splat that straddles the outline goes with its neighbours.
+    probability = random_walk(graph, np.minimum(left[local], 2), np.minimum(stayed[local], 2))
+    solid = local[probability > 0.5]
+    parts = _groups(means, solid)
+    parts = [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+    owners = cKDTree(np.concatenate([means[part] for part in parts])) if parts else None
+    label = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    found = []
+    for i, part in enumerate(parts):
+        members = np.zeros(len(means), bool)
+        members[part] = True
+        # What is under the body goes with it, its contact with the support included: the fill replaces that. So do
+        # splats within its outline that nothing says stayed.
+        inside = np.flatnonzero(near & (height > -floor) & (height < 1.1 * top) & (stayed <= left) & ~members)
+        flat = means[part] @ support.frame()[:2].T
+        footprint = (flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0)
+        inside = inside[convex_footprint(footprint, means[inside] @ support.frame()[:2].T)]
+        assert owners is not None
+        inside = inside[label[owners.query(means[inside])[1]] == i] if len(inside) else inside
+        members[inside] = True
+        found.append((members, support))
+    return found

@@ -25,6 +25,12 @@ class Support(eqx.Module):
         return np.stack([u, np.cross(self.normal, u), self.normal])  # right-handed
 
 
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation by an angle in radians about a unit axis (Rodrigues)."""
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
 def fit_support(
     points: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"],
