@@ -14,6 +14,7 @@ from ltgs_jax.features import FrontEnd
 from .similarity import similarity
 
 _LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise and resampling
+_LEAST_GRADIENT = 0.01  # per pixel, in 0…1: what noise makes of a flat surface
 _COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
 
 
@@ -31,6 +32,8 @@ class DetectConfig:
     """Pixels by which masks are dilated before they are used as outlines."""
     guessed: float = 0.3
     """Dissimilarity to be expected where the scene's colours are guesses, under something that left."""
+    moved: float = 0.05
+    """Least dissimilarity to be expected of an object away from its first place: other light, sides seldom seen."""
     unexplained: float = 0.4
     """Expected dissimilarity from which on the initial scene says nothing: no photograph showed it well enough."""
 
@@ -38,15 +41,14 @@ class DetectConfig:
 class ChangeMap(eqx.Module):
     """What one photograph says of change.
 
-    `score` in robust standard deviations above expectation; `evidence` in −1…1, −1 where the pixel is as expected, 1
-    where it changed, 0 where it cannot be told; `mask` the pixels that changed; `threshold` on the score;
-    `two_classes` whether the split is one (False: the mask is empty, nothing changed).
+    `score` in robust standard deviations above expectation; `left` where the render shows what the photograph does not,
+    −1…1: −1 where the pixel is as expected, 1 where something left, 0 where it cannot be told; `mask` the pixels that
+    changed, whichever way; `two_classes` whether there is a class of changed pixels at all (False: the mask is empty).
     """
 
     score: Float[np.ndarray, "h w"]
-    evidence: Float[np.ndarray, "h w"]
+    left: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
-    threshold: float
     two_classes: bool
 
 
@@ -63,23 +65,47 @@ def change_map(
 
     1 − similarity, less what the scene's own fit lets `expected`, in units of the deviation that unchanged pixels of
     the same expectation show; binarised by Otsu, but never below `config.sigmas`, and only where the part above is a
-    class of its own. Descriptors reach several pixels beyond what changed: the outline is that of the colours.
+    class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, what
+    came has it in the photograph, and where a whole region is sharper in the photograph the scene was never known well.
+    Descriptors reach several pixels beyond what changed: the outline is that of the colours.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
     captured = np.where(valid[..., None], captured, rendered)
     known = valid & (expected < config.unexplained)
     if known.sum() < 64:
         nothing = np.zeros_like(expected, dtype=np.float32)
-        return ChangeMap(nothing, nothing, np.zeros_like(valid), np.inf, False)
-    difference = 1 - similarity(rendered, captured, front_end, gamma=config.gamma)
-    score = _standardize(difference - expected, expected, known, floor=0.01)
-    clipped = np.clip(score[known], 0, 4 * config.sigmas)
-    threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
-    coarse = clean(known & (score > threshold), config.min_area)
-    colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005)
-    mask = _sharpen(coarse, known & (colours > config.sigmas), config)
-    evidence = np.where(known & ~coarse, np.clip(2 * score / threshold, 0, 1) - 1, mask.astype(np.float32))
-    return ChangeMap(score, evidence.astype(np.float32), mask, threshold, bool(mask.any()))
+        return ChangeMap(nothing, nothing, np.zeros_like(valid), False)
+    excess = 1 - similarity(rendered, captured, front_end, gamma=config.gamma) - expected
+    balance = _detail_balance(rendered, captured)
+    scores, masks, thresholds = [], [], []
+    colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas
+    for toward in (balance, -balance):
+        score = _standardize(excess * np.clip(0.5 + toward, 0, 1.25), expected, known, floor=0.01)
+        clipped = np.clip(score[known], 0, 4 * config.sigmas)
+        threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
+        coarse = clean(known & (score > threshold), config.min_area)
+        scores.append(score / threshold)
+        masks.append((coarse, _sharpen(coarse, known & colours, config)))
+        thresholds.append(threshold)
+    (coarse_left, left), (coarse_came, came) = masks
+    plain = np.maximum(*scores)
+    evidence = np.where(known & ~coarse_left & ~coarse_came, np.clip(2 * plain, 0, 1) - 1, left.astype(np.float32))
+    mask = left | came
+    return ChangeMap(plain * max(thresholds), evidence.astype(np.float32), mask, bool(mask.any()))
+
+
+def _detail_balance(
+    rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w"]:
+    """Whose gradients are stronger around each pixel: 1 the render's alone, −1 the photograph's alone."""
+
+    def energy(image):
+        grey = cv2.GaussianBlur(image.mean(axis=-1).astype(np.float32), (0, 0), 1.0)
+        gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)
+        return cv2.GaussianBlur(gx * gx + gy * gy, (0, 0), max(image.shape[:2]) / 100)
+
+    a, b = energy(rendered), energy(captured)
+    return (a - b) / (a + b + _LEAST_GRADIENT**2)
 
 
 def _standardize(

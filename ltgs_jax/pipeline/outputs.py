@@ -22,7 +22,7 @@ from ltgs_jax.io import (
 from ltgs_jax.scene import Chronology, Splats, compose, drop_hidden
 
 from .looks import Eye
-from .visit import Account
+from .state import Account
 
 _STILL = 1e-3  # a pose that changed by less, in object sizes or radians, did not change
 

@@ -32,15 +32,15 @@ from ltgs_jax.io import (
     write_json,
 )
 from ltgs_jax.localize import Localization, localize
-from ltgs_jax.scene import Chronology, Splats, Template
-from ltgs_jax.template import Support
+from ltgs_jax.scene import Chronology
 
 from .config import Config
 from .evaluate import evaluate
 from .looks import Eye, Observation
 from .outputs import never, write_outputs
+from .state import Account, State, pack_splats, pack_state, unpack_splats, unpack_state
 from .store import Store, digest
-from .visit import Account, State, explain_visit
+from .visit import explain_visit
 
 
 class Progress(Protocol):
@@ -129,7 +129,7 @@ def update(
         key = digest(key, run.statuses)
         eye = Eye()
         splats, errors = _initial_scene(store, key, run, scene, given, front_end, eye, progress)
-        state = State(Chronology.of_initial(splats, capture.visits), errors, (), ())
+        state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
@@ -252,19 +252,6 @@ def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, ey
     return unpack_splats("", arrays), arrays["errors"]
 
 
-_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-
-
-def pack_splats(prefix: str, splats: Splats) -> dict[str, np.ndarray]:
-    """Arrays by name."""
-    return {f"{prefix}{field}": np.asarray(getattr(splats, field)) for field in _FIELDS}
-
-
-def unpack_splats(prefix: str, arrays: dict[str, np.ndarray]) -> Splats:
-    """The splats that `pack_splats` named."""
-    return Splats(**{field: arrays[f"{prefix}{field}"] for field in _FIELDS})
-
-
 def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
     """Explain one visit; its state on disk."""
     config = run.config
@@ -292,68 +279,11 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
         for account in accounts:
             identity = after.chronology.templates[account.template].identity
             progress.note(f"{run.capture.visits[t]}: object {identity} {account.kind}")
-        return pack_state(after), {
-            **_state_notes(after),
-            "accounts": [asdict_account(a) for a in accounts],
-            "counts": counts,
-        }
+        arrays, notes = pack_state(after)
+        return arrays, {**notes, "accounts": [a.to_json() for a in accounts], "counts": counts}
 
     arrays, notes = store.run(f"visit_{t:03d}", key, compute)
     return unpack_state(arrays, notes, run.capture.visits), [Account(**a) for a in notes["accounts"]]
-
-
-def asdict_account(account: Account) -> dict:
-    """An account as JSON holds it."""
-    return {
-        "template": account.template,
-        "kind": account.kind,
-        "gain": float(account.gain),
-        "residual": float(account.residual),
-        "views": account.views,
-    }
-
-
-def pack_state(state: State) -> dict[str, np.ndarray]:
-    """A state as arrays by name."""
-    chronology = state.chronology
-    arrays = {
-        **pack_splats("background.", chronology.background),
-        "errors": state.errors,
-        "quat": np.asarray(chronology.world_from_template.quat),
-        "xyz": np.asarray(chronology.world_from_template.xyz),
-        "visible": np.asarray(chronology.visible),
-    }
-    for k, template in enumerate(chronology.templates):
-        arrays |= pack_splats(f"template{k}.", template.splats)
-        arrays[f"template{k}.errors"] = state.template_errors[k]
-        support = state.supports[k]
-        if support is not None:
-            arrays[f"template{k}.support"] = np.asarray([*support.normal, support.offset, support.noise])
-    return arrays
-
-
-def _state_notes(state: State) -> dict:
-    return {"templates": [[m.identity, m.source_visit] for m in state.chronology.templates]}
-
-
-def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, ...]) -> State:
-    """The state that `pack_state` named."""
-    templates, errors, supports = [], [], []
-    for k, (identity, source) in enumerate(notes["templates"]):
-        templates.append(Template(unpack_splats(f"template{k}.", arrays), identity, source))
-        errors.append(arrays[f"template{k}.errors"])
-        packed = arrays.get(f"template{k}.support")
-        supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
-    start = Chronology.of_initial(unpack_splats("background.", arrays), visits)
-    chronology = Chronology(
-        start.background,
-        tuple(templates),
-        SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"])),
-        jnp.asarray(arrays["visible"]),
-        start.exposure,
-        visits,
-    )
-    return State(chronology, arrays["errors"], tuple(errors), tuple(supports))
 
 
 def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chronology:
@@ -365,7 +295,8 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
         later = [(p, view, t) for t in visits for p, view in load_views(run, run.posed(t, "update"), progress)]
         if not state.chronology.templates or not later:
             progress.note("nothing changed: the chronology is the initial scene")
-            return pack_state(state), {**_state_notes(state), "counts": {"steps": 0}}
+            arrays, notes = pack_state(state)
+            return arrays, {**notes, "counts": {"steps": 0}}
         views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
         for _, view, t in later:
             rendered = Eye().image(state.chronology.background, view.camera)
@@ -382,7 +313,8 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
             progress=progress.step,
         )
         fitted = eqx.tree_at(lambda s: s.chronology, state, chronology)
-        return pack_state(fitted), {**_state_notes(fitted), "counts": {"steps": len(losses)}}
+        arrays, notes = pack_state(fitted)
+        return arrays, {**notes, "counts": {"steps": len(losses)}}
 
     arrays, notes = store.run("fit", digest(key, config.fit.long), compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology

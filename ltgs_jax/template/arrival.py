@@ -14,18 +14,19 @@ from ltgs_jax.match import Cone, Instance, carve, grid_around
 from ltgs_jax.scene import Splats, Template
 
 from .config import TemplateConfig
-from .locate import Crop, Refiner, backdrop_error, half_crop
+from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of
 from .support import Support, fit_support, rotation_about
 
 
 class Placement(eqx.Module):
-    """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, and the
-    share of its outlines that lies on the change."""
+    """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
+    its outlines that lies on the change, and its structural likeness to the photographs."""
 
     world_from_template: SE3
     error: float
     gain: float
     overlap: float
+    likeness: float
 
 
 def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -78,7 +79,13 @@ def pose_hypotheses(
 def tilts_of(support: Support) -> list[Float[np.ndarray, "3 3"]]:
     """The rotations that lay an object on each of its other five sides."""
     u, v, _ = support.frame()
-    return [rotation_about(u, np.pi / 2), rotation_about(u, -np.pi / 2), rotation_about(v, np.pi / 2), rotation_about(v, -np.pi / 2), rotation_about(u, np.pi)]
+    return [
+        rotation_about(u, np.pi / 2),
+        rotation_about(u, -np.pi / 2),
+        rotation_about(v, np.pi / 2),
+        rotation_about(v, -np.pi / 2),
+        rotation_about(u, np.pi),
+    ]
 
 
 def thin(splats: Splats, most: int) -> Splats:
@@ -122,12 +129,13 @@ def search_template(
     refiner: Refiner,
     rng: np.random.Generator,
     before: SE3 | None = None,
+    upright: bool = False,
     config: TemplateConfig = TemplateConfig(),
 ) -> Search:
     """Poses at which a template, rendered at many turns and places on the support, looks like the photographs.
 
-    Upright first, and at its pose `before`; on its other sides too if upright explains little. The best few, unlike
-    each other.
+    Upright first, and at its pose `before`; unless `upright`, on its other sides too if upright explains little. The
+    best few, unlike each other.
     """
     light = thin(template.splats, config.search_splats)
     points = np.asarray(light.means, np.float64)[np.asarray(light.opacities) > 0.1]
@@ -147,7 +155,7 @@ def search_template(
         found = Search(light, poses[order], errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():
             best = found
-        if best.best_gain > config.tau_search:
+        if upright or best.best_gain > config.tau_search:
             break
     assert best is not None
     return best
@@ -156,12 +164,11 @@ def search_template(
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
     """Refine the best two poses of a search on the pixels, in all six freedoms."""
     tolerance = 0.1 * size
-    fine = refiner.refine(search.template, search.poses[:2], crop, size=size, tolerance=tolerance, steps=12, blurred=3)
-    winner = int(np.argmin(fine.errors))
-    error = float(fine.errors[winner])
-    without, change = backdrop_error(crop)
-    gain = (without - error) / max(change, 1e-9)
-    return Placement(fine.poses[winner], error, gain, float(fine.overlaps[winner]))
+    found = refiner.refine(search.template, search.poses[:2], crop, size=size, tolerance=tolerance, steps=12, blurred=3)
+    pose = found.poses[int(np.argmin(found.errors))]
+    images, cover = refiner.images(search.template, pose[None], crop, tolerance)
+    error, gain = explained(images[0], crop)
+    return Placement(pose, error, gain, float(overlap_of(cover > 0.5, crop)[0]), likeness(images[0], cover[0], crop))
 
 
 def _unlike(

@@ -43,6 +43,12 @@ def crop_camera(camera: Camera, box: tuple[float, float, float], size: int) -> C
     return Camera(camera.cam_from_world, zoom * (shift @ camera.K), size, size)
 
 
+def _blocks(image: Float[np.ndarray, "h w *c"], step: int) -> Float[np.ndarray, "h2 w2 *c"]:
+    """Means over blocks of `step` × `step` pixels; a remainder at the right and bottom is left out."""
+    h, w = image.shape[0] // step, image.shape[1] // step
+    return image[: h * step, : w * step].reshape(h, step, w, step, *image.shape[2:]).mean(axis=(1, 3))
+
+
 def make_crop(
     cameras: Sequence[Camera],
     targets: Sequence[np.ndarray],
@@ -58,9 +64,9 @@ def make_crop(
 
     def cut(image: np.ndarray, box) -> np.ndarray:
         left, top, side = box
-        if side > 1.5 * size:  # what the window leaves out must not alias
-            blur = 0.4 * side / size
-            image = ndimage.gaussian_filter(image, (blur, blur, 0)[: image.ndim], truncate=2)
+        step = min(int(side / size), min(image.shape[:2]) // 8)
+        if step > 1:  # what the window leaves out must not alias: means over whole blocks of pixels first
+            image, left, top, side = _blocks(image, step), left / step, top / step, side / step
         position = (np.arange(size) + 0.5) * side / size - 0.5
         rows, columns = top + position, left + position
         inside = ((rows > -0.5) & (rows < image.shape[0] - 0.5))[:, None] & (
@@ -120,35 +126,65 @@ _BATCH = 64  # poses rendered in one call of a search
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 
 
-def unlikeness(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
-    """How unlike the photographs each pixel is, 0…1: half by colour, capped, half by structure, which survives other
-    shading; 0 where a pixel does not count."""
-    target, valid = np.asarray(crop.target), np.asarray(crop.valid)
-    colour = np.minimum(np.abs(images - target).mean(axis=-1), _CAP) / _CAP
-    structure = 1 - _structure(images.mean(axis=-1), target.mean(axis=-1))
-    return (0.5 * colour + 0.5 * np.clip(structure, 0, 1)) * valid
+@eqx.filter_jit
+def unlikeness(
+    images: Float[Array, "m v h w 3"], target: Float[Array, "v h w 3"], valid: Bool[Array, "v h w"]
+) -> Float[Array, "m v h w"]:
+    """How unlike the photographs `target` each pixel of the renders is, 0…1: half by colour, capped, half by structure,
+    which survives other shading; 0 where a pixel does not count."""
+    colour = jnp.minimum(jnp.mean(jnp.abs(images - target), axis=-1), _CAP) / _CAP
+    structure = 1 - _structure(jnp.mean(images, axis=-1), jnp.mean(target, axis=-1))
+    return (0.5 * colour + 0.5 * jnp.clip(structure, 0, 1)) * valid
 
 
-def _structure(a: Float[np.ndarray, "m v s s"], b: Float[np.ndarray, "v s s"]) -> Float[np.ndarray, "m v s s"]:
-    """Covariance over variances of two grey images in Gaussian windows of 1.5 px: SSIM without its luminance term."""
-
-    def mean(image):
-        sigma = (0,) * (image.ndim - 2) + (1.5, 1.5)
-        return ndimage.gaussian_filter(image, sigma, truncate=2.5)
-
-    mean_a, mean_b = mean(a), mean(b)
-    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
-    covariance = mean(a * b) - mean_a * mean_b
+def _structure(a: Float[Array, "m v s s"], b: Float[Array, "v s s"]) -> Float[Array, "m v s s"]:
+    """Covariance over variances of two grey images in binomial windows of 7 px: SSIM without its luminance term."""
+    mean_a, mean_b = _window_mean(a), _window_mean(b)
+    var_a, var_b = _window_mean(a * a) - mean_a**2, _window_mean(b * b) - mean_b**2
+    covariance = _window_mean(a * b) - mean_a * mean_b
     floor = 0.03**2
-    return (2 * covariance + floor) / (np.maximum(var_a, 0) + np.maximum(var_b, 0) + floor)
+    return (2 * covariance + floor) / (jnp.maximum(var_a, 0) + jnp.maximum(var_b, 0) + floor)
+
+
+def _window_mean(image: Float[Array, "*b h w"]) -> Float[Array, "*b h w"]:
+    """Binomial mean over 7 × 7 pixels, the border's repeated."""
+    for axis in (image.ndim - 2, image.ndim - 1):
+        padded = jnp.pad(image, [(3, 3) if i == axis else (0, 0) for i in range(image.ndim)], mode="edge")
+        taps = [jax.lax.slice_in_dim(padded, i, i + image.shape[axis], axis=axis) for i in range(7)]
+        image = (taps[0] + taps[6] + 6 * (taps[1] + taps[5]) + 15 * (taps[2] + taps[4]) + 20 * taps[3]) / 64
+    return image
+
+
+def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop) -> float:
+    """Mean structural agreement where the template shows, −1…1, in the middle of the views that show enough of it."""
+    agreement = np.asarray(_structure(jnp.mean(images, axis=-1)[None], jnp.mean(crop.target, axis=-1)))[0]
+    shown = (cover > 0.5) & np.asarray(crop.valid)
+    pixels = shown.sum(axis=(1, 2))
+    enough = pixels > max(0.2 * pixels.max(), 8)
+    if not enough.any():
+        return -1.0
+    means = np.sum(agreement * shown, axis=(1, 2))[enough] / pixels[enough]
+    return float(np.median(means))
 
 
 def backdrop_error(crop: Crop) -> tuple[float, float]:
     """Mean over views of the unlikeness with nothing added to the backdrop; and the part of it that lies where the
     object is."""
-    wrong = unlikeness(np.asarray(crop.backdrop)[None], crop)
+    wrong = _unlike_crop(np.asarray(crop.backdrop)[None], crop)
     inside = np.where(np.asarray(crop.region), wrong, 0)
     return float(_view_errors(wrong, crop).mean()), float(_view_errors(inside, crop).mean())
+
+
+def _unlike_crop(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
+    return np.asarray(unlikeness(images, crop.target, crop.valid))
+
+
+def explained(images: Float[np.ndarray, "v s s 3"], crop: Crop) -> tuple[float, float]:
+    """Mean unlikeness with something added to the backdrop, and the share of the change that it explains; what is drawn
+    beside the change counts against."""
+    without, change = backdrop_error(crop)
+    error = float(_view_errors(_unlike_crop(images[None], crop), crop).mean())
+    return error, (without - error) / max(change, 1e-9)
 
 
 def _view_errors(wrong: Float[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, "m v"]:
@@ -169,7 +205,7 @@ def _composites(template: Splats, poses: SE3, crop: Crop, tolerance, plan: Rende
     return image + (1 - cover)[..., None] * crop.backdrop, cover, out.overflow
 
 
-def _overlap(covered: Bool[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, " m"]:
+def overlap_of(covered: Bool[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, " m"]:
     """Share of the outlines that lies on what changed, pooled over the views that have a region."""
     region, valid = np.asarray(crop.region), np.asarray(crop.valid)
     used = valid & region.any(axis=(1, 2), keepdims=True)
@@ -228,7 +264,7 @@ class Refiner:
         for start in range(0, m, _BATCH):
             index = np.minimum(np.arange(start, start + _BATCH), m - 1)
             images, _ = self.images(template, poses[index], crop, tolerance)
-            errors.append(_view_errors(unlikeness(images, crop), crop).mean(axis=1))
+            errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
         return np.concatenate(errors)[:m]
 
     def slide(
@@ -273,8 +309,9 @@ class Refiner:
     ) -> Refinement:
         """Descend from each of m poses. `size`: the template's diameter in scene units.
 
-        Residuals are colour differences with Geman–McClure weights (scale 0.15); the first `blurred` steps see them
-        blurred, which widens the basin. A step that does not pay is taken back and damped more.
+        Residuals are differences of colour and of grey detail with Geman–McClure weights (scale 0.15); the first
+        `blurred` steps see them blurred, which widens the basin. A step that does not pay is taken back and damped
+        more.
         """
         m = poses.xyz.shape[0]
         delta = np.r_[np.full(3, 0.01 * size), np.full(3, 0.02)]
@@ -295,9 +332,14 @@ class Refiner:
             spread = spread @ SE3.exp(jnp.asarray(np.tile(probes, (m, 1)), jnp.float32))
             images, cover = self.images(template, spread, crop, tolerance)
             images = images.reshape(m, 7, *images.shape[1:])
-            errors = _view_errors(unlikeness(images[:, 0], crop), crop).mean(axis=1)
-            overlaps = _overlap(cover.reshape(m, 7, *cover.shape[1:])[:, 0] > 0.5, crop)
+            errors = _view_errors(_unlike_crop(images[:, 0], crop), crop).mean(axis=1)
+            overlaps = overlap_of(cover.reshape(m, 7, *cover.shape[1:])[:, 0] > 0.5, crop)
             residual = (images - target) * valid
+            # Colours for where it stands; what is left of the greys without their local mean for the rest: that
+            # stays when the object is shaded otherwise.
+            grey = residual.mean(axis=-1, keepdims=True)
+            detail = grey - ndimage.gaussian_filter(grey, (0, 0, 0, 3, 3, 0), truncate=2)
+            residual = np.concatenate([0.5 * residual, 2 * detail], axis=-1)
             if blur:
                 residual = ndimage.gaussian_filter(residual, (0, 0, 0, blur, blur, 0), truncate=2)
             flat = residual.reshape(m, 7, -1)

@@ -17,12 +17,13 @@ _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs
 
 
 class Removal(eqx.Module):
-    """Splats of the scene that left together: mask over the scene, the surface they stood on, votes in pixels, and the
-    number of photographs with enough of them."""
+    """Splats of the scene that left together: mask over the scene, the surface they stood on, votes in pixels, their
+    share of the evidence on these splats, and the number of photographs with enough of them."""
 
     members: Bool[np.ndarray, " n"]
     support: Support | None
     votes: float
+    share: float
     views: int = eqx.field(static=True)
 
 
@@ -67,13 +68,14 @@ def find_removed(
         group = group[~taken[group]]
         if left[group].sum() < least:
             continue
-        for members, support in _solids(means, colors, group, left, stayed, cameras, rng, config):
+        for members, support in _solids(splats, colors, group, left, stayed, cameras, rng, config):
             members = members & ~taken
             votes = float(left[members].sum())
             views = int(np.sum(changed[:, members].sum(axis=1) >= least))
             # One photograph alone may only have something in front of it: it must show more, and solid ground below.
             if votes >= least and (views >= 2 or (views == 1 and support is not None and votes >= 3 * least)):
-                removals.append(Removal(members, support, votes, views))
+                share = votes / (votes + float(stayed[members].sum()))
+                removals.append(Removal(members, support, votes, share, views))
                 taken |= members
     return sorted(removals, key=lambda r: -r.votes)
 
@@ -87,8 +89,56 @@ def _groups(means: Float[np.ndarray, "n 3"], members: Int[np.ndarray, " m"], rea
     return [members[labels == i] for i in range(labels.max() + 1) if (labels == i).sum() >= 8]
 
 
-def _solids(means, colors, group, left, stayed, cameras, rng, config: TemplateConfig):
+def _islands(
+    splats: Splats, height: Float[np.ndarray, " n"], local: Int[np.ndarray, " m"], floor: float, axes
+) -> list[Int[np.ndarray, " p"]]:
+    """Things that stand apart above a surface, each an array of indices among `local`.
+
+    What is firm and clear of the surface makes an island; what is faint or low joins the one whose outline it is in.
+    """
+    means = np.asarray(splats.means, np.float64)
+    firm = local[(np.asarray(splats.opacities)[local] > 0.2) & (height[local] > 2 * floor)]
+    rest = np.setdiff1d(local, firm)
+    islands = []
+    for island in _groups(means, firm, reach=2.0):
+        inside = _within_outline(means, island, rest, axes) & (height[rest] < 1.1 * height[island].max())
+        islands.append(np.concatenate([island, rest[inside]]))
+        rest = rest[~inside]
+    return islands
+
+
+def _within_outline(means, body, queries, axes) -> Bool[np.ndarray, " q"]:
+    """Which splats lie over the convex outline, a tenth wider, that a body has on its support."""
+    flat = means[body] @ axes.T
+    return convex_footprint((flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0), means[queries] @ axes.T)
+
+
+def _parts(splats, colors, height, local, body, floor, axes, left, stayed, config: TemplateConfig) -> list[np.ndarray]:
+    """What of the `local` splats above a support left, one array of indices for each solid thing.
+
+    A thing that stands apart goes as a whole once a good part of it is seen to have changed: turned or shifted a
+    little, it still has its own colours in many places. What touches its neighbours is cut from them by a random walk.
+    """
+    means = np.asarray(splats.means, np.float64)
+    size = np.linalg.norm(np.ptp(means[body], axis=0))
+    parts, rest = [], local
+    for island in _islands(splats, height, local, floor, axes):
+        told = left[island].sum() / max((left + stayed)[island].sum(), 1e-9)
+        alone = np.linalg.norm(np.ptp(means[island], axis=0)) < 2 * size
+        if told > config.whole and alone and left[island].sum() > 0.1 * left[body].sum():
+            parts.append(island)
+            rest = np.setdiff1d(rest, island)
+    if len(np.intersect1d(rest, body)) >= 8:
+        graph = neighbour_graph(means[rest], colors[rest], color_scale=config.cut_color)
+        # Capped, so that a splat that straddles the outline goes with its neighbours.
+        probability = random_walk(graph, np.minimum(left[rest], 2), np.minimum(stayed[rest], 2))
+        parts += _groups(means, rest[probability > 0.5])
+    return [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+
+
+def _solids(splats: Splats, colors, group, left, stayed, cameras, rng, config: TemplateConfig):
     """The solid things in one group: masks of splats, with what is under them on the surface they stand on."""
+    means = np.asarray(splats.means, np.float64)
     center = np.median(means[group], axis=0)
     radius = np.linalg.norm(means[group] - center, axis=1).max() + 1e-9
     near = np.linalg.norm(means - center, axis=1) < 3 * radius
@@ -98,33 +148,25 @@ def _solids(means, colors, group, left, stayed, cameras, rng, config: TemplateCo
         members = np.zeros(len(means), bool)
         members[group] = True
         return [(members, None)]
-    height = support.height(means)
+    height, axes = support.height(means), support.frame()[:2]
     top = np.quantile(height[group], 0.95)
     floor = max(config.flat * support.noise, 0.05 * top)
     body = group[height[group] > floor]
-    if top < floor * 1.5 or left[body].sum() < 0.2 * left[group].sum():
+    if len(body) < 8 or top < floor * 1.5 or left[body].sum() < 0.2 * left[group].sum():
         return []
     local = np.flatnonzero(near & (height > floor))
-    graph = neighbour_graph(means[local], colors[local], color_scale=config.cut_color)
-    # Capped, so that a splat that straddles the outline goes with its neighbours.
-    probability = random_walk(graph, np.minimum(left[local], 2), np.minimum(stayed[local], 2))
-    solid = local[probability > 0.5]
-    parts = _groups(means, solid)
-    parts = [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
-    owners = cKDTree(np.concatenate([means[part] for part in parts])) if parts else None
-    label = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    parts = _parts(splats, colors, height, local, body, floor, axes, left, stayed, config)
+    # What is under the body goes with it, its contact with the support included: the fill replaces that. So do splats
+    # within its outline that nothing says stayed.
+    free = near & (height > -floor) & (height < 1.1 * top) & (stayed <= left)
+    free[np.concatenate([*parts, np.zeros(0, int)])] = False
     found = []
-    for i, part in enumerate(parts):
+    for part in parts:
+        below = np.flatnonzero(free)
+        below = below[_within_outline(means, part, below, axes)]
+        free[below] = False
         members = np.zeros(len(means), bool)
         members[part] = True
-        # What is under the body goes with it, its contact with the support included: the fill replaces that. So do
-        # splats within its outline that nothing says stayed.
-        inside = np.flatnonzero(near & (height > -floor) & (height < 1.1 * top) & (stayed <= left) & ~members)
-        flat = means[part] @ support.frame()[:2].T
-        footprint = (flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0)
-        inside = inside[convex_footprint(footprint, means[inside] @ support.frame()[:2].T)]
-        assert owners is not None
-        inside = inside[label[owners.query(means[inside])[1]] == i] if len(inside) else inside
-        members[inside] = True
+        members[below] = True
         found.append((members, support))
     return found
