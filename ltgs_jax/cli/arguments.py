@@ -34,6 +34,24 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Capture:
+    """Make a capture of a folder of photographs, one sub-folder per visit: upright, with the cameras of all."""
+
+    folder: Positional[Path]
+    """Folder with one sub-folder of photographs per visit (of a video: its frames)."""
+    out: Path
+    """Folder of the capture; it must not hold anything yet."""
+    visits: tuple[str, ...] = ()
+    """The sub-folders in the order of the visits, the densely photographed one first; by name unless given."""
+    first: int = 100
+    """Most photographs of the first visit; of more, as of a video's frames, the sharpest of each stretch are kept."""
+    later: int = 24
+    """Most photographs of each later visit."""
+    max_side: int = 1600
+    """Longest side of the photographs in the capture, in pixels; 0 leaves their size as it is."""
+
+
+@dataclass(frozen=True)
 class Update(Generic[C]):
     """Find what changed in a capture, and give the scene at every visit. Run again, it resumes."""
 
@@ -104,6 +122,7 @@ class View:
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
+    "capture": Capture,
     "update": Update,
     "eval": Eval,
     "render": Render,

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from ltgs_jax.io import InputError, read_json
 
-from .arguments import Demo, Eval, Export, Render, Update, View
+from .arguments import Capture, Demo, Eval, Export, Render, Update, View
 from .progress import Reporter, make_reporter
 
 
@@ -54,6 +54,40 @@ def _make_demo_capture(folder: Path, options: Demo, progress: Reporter) -> None:
     make_capture(beside, scene=options.scene, seed=options.seed)
     write_json(beside / story.name, told)
     beside.rename(folder)
+
+
+@run.register
+def _capture(options: Capture) -> None:
+    from ltgs_jax import pipeline
+
+    for name, least in (("first", 3), ("later", 1), ("max_side", 0)):
+        if getattr(options, name) < least:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: expected at least {least}")
+    config = pipeline.IntakeConfig(first=options.first, later=options.later, max_side=options.max_side)
+    with _reporting() as progress:
+        record = pipeline.make_capture(
+            options.folder, options.out, visits=options.visits, config=config, progress=progress
+        )
+    _console().print(capture_table(record))
+    for entry in record["photographs"]:
+        if entry["status"] == "rejected":
+            print(f"left out: {entry['name']}: {entry['reason'] or 'not part of the scene that was found'}")
+    lens = record["lenses"][0]
+    print(f"{record['points']} points, mean error {record['error_px']:.2f} px, focal length {lens['params'][0]:.0f} px")
+    print(f"capture: {options.out}\nnext: ltgs update {options.out} --out {options.out}_chronology")
+
+
+def capture_table(record: dict) -> Table:
+    """What became of the photographs, one line per visit."""
+    table = Table()
+    table.add_column("visit")
+    columns = ("found", "thinned out", "mapped", "localized", "rejected")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for visit in record["visits"]:
+        mine = [p["status"] for p in record["photographs"] if p["name"].split("/")[0] == visit]
+        table.add_row(Text(visit), str(len(mine)), *(str(mine.count(status)) for status in columns[1:]))
+    return table
 
 
 @run.register
@@ -142,11 +176,13 @@ def _finish(folder: Path, rows: Sequence[dict]) -> None:
     from ltgs_jax.report import write_report
 
     report = write_report(folder)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=120)  # a log file is no narrower than that
-    console.print(score_table(rows))
+    _console().print(score_table(rows))
     print(f"report: {report}")
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=120)  # a log file is no narrower than that
 
 
 def _chronology(folder: Path) -> Path:

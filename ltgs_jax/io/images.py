@@ -189,7 +189,7 @@ def resize_mask(mask: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np
 def write_image(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w"]) -> None:
     """Write an image in 0..1 with 8 bits, by the suffix, in one step. Raises InputError."""
     pixels = np.rint(np.clip(np.nan_to_num(np.asarray(image)), 0, 1) * 255).astype(np.uint8)
-    _write_pixels(Path(path), pixels)
+    write_pixels(Path(path), pixels)
 
 
 def _label_dtype(labels: np.ndarray) -> type:
@@ -201,7 +201,7 @@ def write_labels(path: str | Path, labels: Integer[np.ndarray, "h w"]) -> None:
     labels = np.asarray(labels)
     if labels.size and not 0 <= labels.min() <= labels.max() < 1 << 16:
         raise ValueError(f"labels: expected ids from 0 to 65535, got {labels.min()} to {labels.max()}")
-    _write_pixels(Path(path), labels.astype(_label_dtype(labels)))
+    write_pixels(Path(path), labels.astype(_label_dtype(labels)))
 
 
 def read_labels(path: str | Path) -> Integer[np.ndarray, "h w"]:
@@ -209,7 +209,8 @@ def read_labels(path: str | Path) -> Integer[np.ndarray, "h w"]:
     return read_pixels(Path(path))[..., 0]
 
 
-def _write_pixels(path: Path, pixels: np.ndarray) -> None:
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Write pixels [h w] or [h w c] in their own type, by the suffix, in one step. Raises InputError."""
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     with replacing(path) as beside:

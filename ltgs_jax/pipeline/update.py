@@ -3,8 +3,7 @@
 import dataclasses
 import os
 import platform
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -37,6 +36,7 @@ from ltgs_jax.template import Support
 
 from .config import Config
 from .evaluate import evaluate
+from .hold import only_run
 from .looks import Eye, Observation
 from .outputs import never, write_outputs
 from .store import Store, digest
@@ -70,27 +70,6 @@ class Run:
         return [p for p in self.capture.at(visit, role) if p.name in self.cameras]
 
 
-@contextmanager
-def _only_run(folder: Path) -> Iterator[None]:
-    """Holds the folder for this process; a second run into it is refused, a dead one's hold is taken over."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = folder / ".running"
-    try:
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    except FileExistsError:
-        holder = lock.read_text().strip()
-        if holder.isdecimal() and Path(f"/proc/{holder}").exists() and int(holder) != os.getpid():
-            raise InputError(f"{folder}: another run (process {holder}) is writing there") from None
-        lock.unlink(missing_ok=True)
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    os.write(handle, str(os.getpid()).encode())
-    os.close(handle)
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-
-
 def update(
     capture_dir: str | Path,
     out_dir: str | Path,
@@ -110,11 +89,7 @@ def update(
     given = Path(initial) if initial is not None else capture.initial_ply
     scene = read_ply(given) if given is not None else None
     front_end = front_end or Classical()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from None
-    with _only_run(out):
+    with only_run(out):
         for name, reason in capture.problems:
             progress.warn(f"{name}: {reason}")
         write_json(
