@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import equinox as eqx
 from jaxtyping import Array, Float
 
 from ltgs_jax import pipeline
@@ -17,7 +16,6 @@ from ltgs_jax.io import read_splats as read_splats
 from ltgs_jax.io import read_tracks as read_tracks
 from ltgs_jax.io import write_image as write_image
 from ltgs_jax.io import write_splats as write_splats
-from ltgs_jax.render import plan_render
 from ltgs_jax.render import render as render_fully
 from ltgs_jax.scene import Chronology as Chronology
 from ltgs_jax.scene import Splats as Splats
@@ -55,9 +53,9 @@ def update(
 ) -> Chronology:
     """Find what changed in a capture; `ltgs update` for scripts.
 
-    Args: `capture` the folder (docs/formats.md); `out` the folder of the chronology, resumed when it has stages of the
-    same inputs (None: a temporary one, removed at the end); `preset` fast, paper or tiny, or `config` with every option;
-    `initial` a trained splat scene of the first visit; `progress` is called with each line of what a run says.
+    `capture` is its folder (docs/formats.md); `out` the folder of the chronology, gone on with when it has stages of
+    the same inputs (None: a temporary one, removed at the end); `preset` fast, paper or tiny, or `config` with every
+    option; `initial` a trained splat scene of the first visit. `progress` is called with each line that a run says.
     Raises InputError (a ValueError), one line, for what is wrong with the capture; ValueError for an unknown preset.
     """
     if preset not in pipeline.PRESETS:
@@ -84,15 +82,9 @@ def cameras(folder: str | Path) -> dict[str, Camera]:
     return {name: camera for name, (_, _, camera) in found.items()}
 
 
-@eqx.filter_jit
-def _image(splats: Splats, camera: Camera, plan) -> Float[Array, "h w 3"]:
-    return render_fully(splats, camera, plan=plan).image
-
-
 def render(splats: Splats, camera: Camera) -> Float[Array, "h w 3"]:
     """The image [h w 3] of splats, on black, in the splats' dtype.
 
-    For alpha, depth, gradients and batches of cameras see `ltgs_jax.render.render`, of which this is the image alone,
-    compiled once for each number of splats and image size.
+    For alpha, depth, gradients and batches of cameras see `ltgs_jax.render.render`, of which this is the image alone.
     """
-    return _image(splats, camera, plan_render(splats, camera))
+    return render_fully(splats, camera).image

@@ -4,6 +4,7 @@ import contextlib
 import shutil
 import signal
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import singledispatch
 from pathlib import Path
 from typing import Any
@@ -98,12 +99,23 @@ def _update(options: Update) -> None:
         pipeline.update(
             options.capture,
             options.out,
-            config=options.config,
+            config=_with_limits(options),
             initial=options.initial,
             seed=options.seed,
             progress=progress,
         )
     _finish(options.out, read_json(options.out / "metrics.json", list))
+
+
+def _with_limits(options: Update) -> Any:
+    """The options of the rooms, with the two that have a short name."""
+    config = options.config
+    if options.max_splats is not None:
+        initial = replace(config.fit.initial, max_splats=options.max_splats)
+        config = replace(config, fit=replace(config.fit, initial=initial))
+    if options.max_side is not None:
+        config = replace(config, io=replace(config.io, max_side=options.max_side))
+    return config
 
 
 @run.register
@@ -129,8 +141,9 @@ def _render(options: Render) -> None:
 def _export(options: Export) -> None:
     from ltgs_jax import pipeline
 
-    visit = visit_number(_chronology(options.folder), options.visit)
-    pipeline.export_visit(options.folder, visit, options.format, options.out)
+    folder = _chronology(options.folder)
+    visit = None if options.visit is None else visit_number(folder, options.visit)
+    pipeline.export(folder, options.format, options.out, visit=visit, capture=options.capture)
     print(options.out)
 
 

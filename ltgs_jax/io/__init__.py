@@ -37,6 +37,7 @@ from .photographs import load_image as load_image
 from .photographs import load_mask as load_mask
 from .ply import read_ply as read_ply
 from .ply import write_ply as write_ply
+from .splat_files import SPLAT_FORMATS as SPLAT_FORMATS
 from .splat_files import WRITERS as WRITERS
 from .splat_files import read_splats as read_splats
 from .splat_files import write_splats as write_splats

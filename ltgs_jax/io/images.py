@@ -14,6 +14,8 @@ from .lens import CameraModel, distort_map, is_pinhole, undistort_map
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 _MOST_PIXELS = 1 << 28  # 268 megapixels: beyond any camera; a header that claims more is not believed
 _MOST_PIXELS_PER_BYTE = 4000  # an empty mask as PNG reaches 1000; beyond this the header is not believed
+_LARGE_PIXELS = 1 << 25  # beyond 33 megapixels, where it costs memory, a picture must be one
+_MOST_PIXELS_PER_BYTE_LARGE = 50  # a plain wall as JPEG reaches 30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,8 @@ def read_header(path: Path) -> ImageHeader:
     image.close()
     width, height = spec.width, spec.height
     size = path.stat().st_size
-    if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, _MOST_PIXELS_PER_BYTE * size)):
+    per_byte = _MOST_PIXELS_PER_BYTE if width * height <= _LARGE_PIXELS else _MOST_PIXELS_PER_BYTE_LARGE
+    if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, per_byte * size)):
         raise InputError(f"{path}: its header claims {width}×{height} pixels in {size} bytes")
     # Equivalent focal lengths refer to film 36 mm wide.
     equivalent = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)

@@ -4,6 +4,7 @@ import dataclasses
 import os
 import platform
 from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -15,7 +16,7 @@ import numpy as np
 
 from ltgs_jax.detect import fit_tone, similarity
 from ltgs_jax.features import Classical, FrontEnd
-from ltgs_jax.fit import View, VisitView, fit_chronology, fit_initial, splats_from_points
+from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import (
     CameraModel,
@@ -34,10 +35,11 @@ from ltgs_jax.localize import Localization, localize
 from ltgs_jax.scene import Chronology, Splats, Template
 from ltgs_jax.template import Support
 
-from .config import Config
+from .config import Config, check_config
 from .evaluate import evaluate
 from .hold import only_run
 from .looks import Eye, Observation
+from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .store import Store, digest
 from .visit import Account, State, explain_visit
@@ -84,6 +86,7 @@ def update(
 
     Raises InputError, one line, for what is wrong with the capture or an option.
     """
+    check_config(config, seed)
     out = Path(out_dir)
     capture = read_capture(capture_dir)
     given = Path(initial) if initial is not None else capture.initial_ply
@@ -96,6 +99,7 @@ def update(
             out / "config.json", {**dataclasses.asdict(config), "seed": seed, "initial": str(given) if given else None}
         )
         write_json(out / "env.json", _environment())
+        say_outlook(look_ahead(capture, config, None if scene is None else scene.count), progress)
         store = Store(out, progress)
         key = digest(
             config, seed, [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
@@ -176,12 +180,18 @@ def load_view(run: Run, photograph: Photograph) -> View:
     )
 
 
-def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, View]]:
-    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error."""
-    views = []
+def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, StreamedView]]:
+    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error.
+
+    Each is decoded once here; the pixels of as many as `io.photograph_bytes` holds stay in memory.
+    """
+    views, budget = [], Budget(run.config.io.photograph_bytes)
     for photograph in photographs:
+        camera = scaled_camera(run.cameras[photograph.name], run.config.io.max_side)
+        view = StreamedView(camera, partial(load_view, run, photograph), budget)
         try:
-            views.append((photograph, load_view(run, photograph)))
+            view.check()
+            views.append((photograph, view))
         except InputError as error:
             progress.warn(f"{photograph.name}: left out, {error}")
     if photographs and not views:
