@@ -351,7 +351,7 @@ def test_the_installed_command_answers_without_importing_jax():
 
 
 def test_an_unknown_command_is_a_usage_error():
-    with pytest.raises(UsageError, match="demo, update, eval"):
+    with pytest.raises(UsageError, match="demo, capture, update, eval"):
         parse(["explode"])
 
 
