@@ -7,9 +7,11 @@ from ltgs_jax.io import Capture, scaled_size
 
 from .config import Config
 
-_BASE_BYTES = 900 << 20  # the interpreter with jax, OpenCV and COLMAP loaded and some programs compiled
+# From peaks of runs on the CPU: 1.4 to 2.5 GB where photographs and splats are few (jax, OpenCV and COLMAP loaded,
+# programs compiled, candidate poses rendered in batches), and 4.25 GB for 400 photographs of 1600×1200.
+_BASE_BYTES = 2200 << 20
+_BYTES_PER_PIXEL = 1100  # render and loss with their gradients, per pixel of the largest photograph
 _COPIES = 8  # parameters, gradient, two moments of Adam, and what a step donates and copies
-_BYTES_PER_PIXEL = 2600  # render and loss with their gradients, per pixel of the largest photograph
 
 
 @dataclass(frozen=True)

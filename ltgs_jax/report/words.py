@@ -20,6 +20,7 @@ EVENT_WORDS = {
 
 ROLE_WORDS = {"train": "fitted", "update": "used", "test": "held out", "unused": "not used"}
 SCORE_WORDS = {"psnr_initial": "psnr of the first visit's scene"}
+_LEAST_TURN = 0.5  # degrees; less would read "turned 0°"
 _POOR_DB = 20.0  # below, a render is a blur in which an object can come or go unseen
 
 
@@ -86,7 +87,7 @@ def _sentence(run: Run, thing: Object, state: State) -> str:
     distance, angle = moved
     length = number(distance) + (f" ({distance / thing.size:.1f} × its size)" if thing.size > 0 else "")
     parts = [f"came back, {length} from where it was" if state.event == "added" else f"{words} by {length}"]
-    if state.ambiguous_axis is None:
+    if state.ambiguous_axis is None and angle >= _LEAST_TURN:
         parts.append(f"turned {angle:.0f}°")
     return ", ".join(parts)
 
