@@ -87,6 +87,25 @@ def test_a_held_folder_is_refused_and_a_dead_run_s_is_not(tmp_path):
     assert not (tmp_path / ".running").exists()
 
 
+def test_an_interrupted_intake_goes_on_and_other_options_start_over(tmp_path, monkeypatch):
+    """Structure from motion is stopped; what was brought in before stays, unless the options are others."""
+    for i in range(3):
+        _noise(tmp_path / "in" / "a" / f"{i}.png", i)
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ltgs_jax.pipeline.intake.reconstruct", stop)
+    images = tmp_path / ".out.making" / "images" / "a"
+    times = []
+    for config in (IntakeConfig(), IntakeConfig(), IntakeConfig(max_side=20)):
+        with pytest.raises(KeyboardInterrupt):
+            make_capture(tmp_path / "in", tmp_path / "out", config=config, progress=Silent())
+        assert not (tmp_path / "out").exists() and not (tmp_path / ".out.making" / ".running").exists()
+        times.append({path.name: path.stat().st_mtime_ns for path in images.iterdir()})
+    assert len(times[0]) == 3 and times[0] == times[1] and times[2] != times[1]
+
+
 @pytest.mark.slow
 def test_structure_of_known_cameras_is_found(tmp_path):
     """Photographs of a made-up room: after the best similarity, every camera is where it was."""

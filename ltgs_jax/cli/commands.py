@@ -206,7 +206,10 @@ def _chronology(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _reporting() -> Iterator[Reporter]:
-    """A reporter that is closed at the end; a polite kill then ends like Ctrl-C."""
+    """A reporter that is closed at the end; a polite kill then ends like Ctrl-C.
+
+    To be entered after the pipeline is imported: the import of pycolmap takes the signal for itself.
+    """
 
     def interrupt(*_) -> None:
         raise KeyboardInterrupt
