@@ -60,6 +60,8 @@ def write_outputs(
             },
         )
         shown = [p for p in cameras.values() if (p.visit > 0 and p.role in ("update", "test")) or p.role == "test"]
+        if not any(p.visit == 0 for p in shown):  # one, by which the first scene can be judged
+            shown += [p for p in cameras.values() if p.visit == 0][:1]
         manifest = []
         for i, photograph in enumerate(shown):
             progress.step(i, len(shown), f"rendering {photograph.name}")

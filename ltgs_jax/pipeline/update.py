@@ -3,8 +3,8 @@
 import dataclasses
 import os
 import platform
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -16,7 +16,7 @@ import numpy as np
 
 from ltgs_jax.detect import fit_tone, similarity
 from ltgs_jax.features import Classical, FrontEnd
-from ltgs_jax.fit import View, VisitView, fit_chronology, fit_initial, splats_from_points
+from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import (
     CameraModel,
@@ -34,9 +34,11 @@ from ltgs_jax.io import (
 from ltgs_jax.localize import Localization, localize
 from ltgs_jax.scene import Chronology
 
-from .config import Config
+from .config import Config, check_config
 from .evaluate import evaluate
+from .hold import only_run
 from .looks import Eye, Observation
+from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .state import Account, State, pack_splats, pack_state, unpack_splats, unpack_state
 from .store import Store, digest
@@ -70,27 +72,6 @@ class Run:
         return [p for p in self.capture.at(visit, role) if p.name in self.cameras]
 
 
-@contextmanager
-def _only_run(folder: Path) -> Iterator[None]:
-    """Holds the folder for this process; a second run into it is refused, a dead one's hold is taken over."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = folder / ".running"
-    try:
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    except FileExistsError:
-        holder = lock.read_text().strip()
-        if holder.isdecimal() and Path(f"/proc/{holder}").exists() and int(holder) != os.getpid():
-            raise InputError(f"{folder}: another run (process {holder}) is writing there") from None
-        lock.unlink(missing_ok=True)
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    os.write(handle, str(os.getpid()).encode())
-    os.close(handle)
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-
-
 def update(
     capture_dir: str | Path,
     out_dir: str | Path,
@@ -105,22 +86,20 @@ def update(
 
     Raises InputError, one line, for what is wrong with the capture or an option.
     """
+    check_config(config, seed)
     out = Path(out_dir)
     capture = read_capture(capture_dir)
     given = Path(initial) if initial is not None else capture.initial_ply
     scene = read_ply(given) if given is not None else None
     front_end = front_end or Classical()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from None
-    with _only_run(out):
+    with only_run(out):
         for name, reason in capture.problems:
             progress.warn(f"{name}: {reason}")
         write_json(
             out / "config.json", {**dataclasses.asdict(config), "seed": seed, "initial": str(given) if given else None}
         )
         write_json(out / "env.json", _environment())
+        say_outlook(look_ahead(capture, config, None if scene is None else scene.count), progress)
         store = Store(out, progress)
         key = digest(
             config, seed, [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
@@ -201,12 +180,18 @@ def load_view(run: Run, photograph: Photograph) -> View:
     )
 
 
-def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, View]]:
-    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error."""
-    views = []
+def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, StreamedView]]:
+    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error.
+
+    Each is decoded once here; the pixels of as many as `io.photograph_bytes` holds stay in memory.
+    """
+    views, budget = [], Budget(run.config.io.photograph_bytes)
     for photograph in photographs:
+        camera = scaled_camera(run.cameras[photograph.name], run.config.io.max_side)
+        view = StreamedView(camera, partial(load_view, run, photograph), budget)
         try:
-            views.append((photograph, load_view(run, photograph)))
+            view.check()
+            views.append((photograph, view))
         except InputError as error:
             progress.warn(f"{photograph.name}: left out, {error}")
     if photographs and not views:
