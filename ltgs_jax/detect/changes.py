@@ -26,6 +26,8 @@ class DetectConfig:
     """γ, the share of semantic cosine against SSIM."""
     sigmas: float = 5.0
     """A difference counts from this many robust standard deviations of the unchanged pixels on."""
+    alone: float = 10.0
+    """Mean score, in the same deviations, of something that only one photograph shows."""
     min_area: float = 4e-4
     """Smallest region, as a share of the image."""
     dilate: int = 3
@@ -65,8 +67,8 @@ def change_map(
 
     1 − similarity, less what the scene's own fit lets `expected`, in units of the deviation that unchanged pixels of
     the same expectation show; binarised by Otsu, but never below `config.sigmas`, and only where the part above is a
-    class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, what
-    came has it in the photograph, and where a whole region is sharper in the photograph the scene was never known well.
+    class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, and
+    that alone is proof; what came has it in the photograph, as has all that the scene never knew well.
     Descriptors reach several pixels beyond what changed: the outline is that of the colours.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
@@ -79,8 +81,8 @@ def change_map(
     balance = _detail_balance(rendered, captured)
     scores, masks, thresholds = [], [], []
     colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas
-    for toward in (balance, -balance):
-        score = _standardize(excess * np.clip(0.5 + toward, 0, 1.25), expected, known, floor=0.01)
+    for weight in (np.clip(0.5 + balance, 0, 1.25), np.clip(1 - balance, 0, 1)):
+        score = _standardize(excess * weight, expected, known, floor=0.01)
         clipped = np.clip(score[known], 0, 4 * config.sigmas)
         threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
         coarse = clean(known & (score > threshold), config.min_area)
@@ -89,8 +91,10 @@ def change_map(
         thresholds.append(threshold)
     (coarse_left, left), (coarse_came, came) = masks
     plain = np.maximum(*scores)
-    evidence = np.where(known & ~coarse_left & ~coarse_came, np.clip(2 * plain, 0, 1) - 1, left.astype(np.float32))
     mask = left | came
+    # Where both have detail, one thing took another's place.
+    replaced = left | (came & (balance > -0.3))
+    evidence = np.where(known & ~coarse_left & ~coarse_came, np.clip(2 * plain, 0, 1) - 1, replaced.astype(np.float32))
     return ChangeMap(plain * max(thresholds), evidence.astype(np.float32), mask, bool(mask.any()))
 
 

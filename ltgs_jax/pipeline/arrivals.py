@@ -295,7 +295,8 @@ def _new_object(
     if not config.template.tau_new <= gain <= 1.3:
         progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
         return state, None
-    errors = np.full(template.splats.count, 0.5 * config.detect.guessed, state.errors.dtype)
+    errors = np.full(template.splats.count, config.detect.moved, state.errors.dtype)
+    progress.note(f"DEBUG bared {arrival.bared:.2f} flat {_is_flat(template, arrival.support)} gain {gain:.2f}")
     if arrival.bared > 0.4 and _is_flat(template, arrival.support):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
         return extend_background(state, template.splats, errors, np.zeros(len(errors), bool)), None

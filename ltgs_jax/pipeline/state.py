@@ -79,12 +79,18 @@ def set_from(state: State, t: int, k: int, *, visible: bool, pose: SE3 | None = 
     poses = chronology.world_from_template
     if pose is not None:
         # Sides and edges that the first pose never showed: only a strong difference there is a change.
-        state = eqx.tree_at(lambda s: s.template_errors[k], state, np.maximum(state.template_errors[k], unsure))
+        state = doubt_template(state, k, np.full(len(state.template_errors[k]), unsure))
         quat, xyz = np.array(poses.quat), np.array(poses.xyz)
         quat[t:, k], xyz[t:, k] = np.asarray(pose.quat), np.asarray(pose.xyz)
         poses = SE3(quat, xyz)
     chronology = eqx.tree_at(lambda c: (c.visible, c.world_from_template), chronology, (flags, poses))
     return eqx.tree_at(lambda s: s.chronology, state, chronology)
+
+
+def doubt_template(state: State, k: int, least: Float[np.ndarray, " m"]) -> State:
+    """Template k with at least these errors expected of its splats."""
+    errors = np.maximum(state.template_errors[k], least).astype(np.float32)
+    return eqx.tree_at(lambda s: s.template_errors[k], state, errors)
 
 
 def next_identity(state: State) -> int:

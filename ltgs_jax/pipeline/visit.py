@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ltgs_jax.detect import dilate
+from ltgs_jax.detect import dilate, similarity
 from ltgs_jax.features import FrontEnd
-from ltgs_jax.match import find_instances
+from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.template import unlikeness
 
 from .arrivals import place_arrivals, turn_in_place
 from .config import Config
 from .departures import take_out
-from .looks import Eye, Observation, compare, cone_of
-from .state import Account, State, drop_template, extend_background, scene_at, set_from
+from .looks import Evidence, Eye, Observation, compare, cone_of
+from .state import Account, State, doubt_template, drop_template, extend_background, scene_at, set_from
 
 
 def explain_visit(
@@ -64,13 +64,28 @@ def explain_visit(
     splats, _, _, guessed = scene
     surface = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.3]
     bared = [eye.paint(splats, o.camera, guessed[:, None])[..., 0] > 0.5 for o in observations]
-    instances = find_instances(cones, surface, config=config.match)
+    instances = [
+        instance
+        for instance in find_instances(cones, surface, config=config.match)
+        if instance.views > 1 or _strength(instance, evidence) > config.detect.alone
+    ]
     progress.note(f"visit {t}: {len(gone)} left their place, {len(turned) + len(instances)} came")
     state, accounts = place_arrivals(
         state, t, gone, instances, observations, evidence, bared, surface, front_end, **tools
     )
     accounts += turned
-    return *_put_back(state, t, gone, accounts, known, observations, eye=eye, config=config, progress=progress), coarse
+    state, accounts = _put_back(
+        state, t, gone, accounts, known, observations, eye=eye, config=config, progress=progress
+    )
+    return _learn_errors(state, t, accounts, observations, front_end, eye, config), accounts, coarse
+
+
+def _strength(instance: Instance, evidence: Evidence) -> float:
+    """Mean score of the pixels that changed within an instance's outlines."""
+    pixels = [
+        change.score[region & change.mask] for change, region in zip(evidence.changes, instance.regions, strict=True)
+    ]
+    return float(np.mean(np.concatenate([*pixels, np.zeros(1)])))
 
 
 def _put_back(
@@ -109,6 +124,25 @@ def _put_back(
             for a in final.values()
         }
     return state, [final[k] for k in sorted(final)]
+
+
+def _learn_errors(
+    state: State, t: int, accounts: Sequence[Account], observations, front_end: FrontEnd, eye: Eye, config: Config
+) -> State:
+    """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them."""
+    placed = [a for a in accounts if a.kind in ("moved", "added")]
+    if not placed:
+        return state
+    splats, _, owner, _ = scene_at(state, t)
+    votes = np.zeros((splats.count, 2))
+    for o in observations:
+        unlike = 1 - similarity(eye.image(splats, o.camera), o.image, front_end, gamma=config.detect.gamma)
+        votes += eye.votes(splats, o.camera, np.stack([unlike * o.valid, o.valid], axis=-1))
+    for account in placed:
+        mine = votes[owner == account.template + 1]
+        learned = (mine[:, 0] + config.detect.guessed) / (mine[:, 1] + 1)
+        state = doubt_template(state, account.template, np.where(mine[:, 1] > 0.3, learned, 0.0))
+    return state
 
 
 def _unlike_where_different(
