@@ -296,7 +296,6 @@ def _new_object(
         progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
         return state, None
     errors = np.full(template.splats.count, config.detect.moved, state.errors.dtype)
-    progress.note(f"DEBUG bared {arrival.bared:.2f} flat {_is_flat(template, arrival.support)} gain {gain:.2f}")
     if arrival.bared > 0.4 and _is_flat(template, arrival.support):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
         return extend_background(state, template.splats, errors, np.zeros(len(errors), bool)), None
