@@ -2,14 +2,14 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ltgs_jax.geometry import SE3
 
-from .align import squared_residuals
-from .hypotheses import Problem
+from .align import alignment_moments, squared_residuals
+from .hypotheses import Problem, reweighted, score
 from .outcome import RegisterConfig
-from .refine import BOUND_IN_SIGMA, approach, isotropic_whitener
+from .refine import BOUND_IN_SIGMA, probability_within
 
 # Levels that are weighed against each other, the given bound first; each starts from the one before.
 _FACTORS = (1.0, 0.5, 0.25)
@@ -49,20 +49,28 @@ def log_evidence(
     return jnp.sum(weights * mixture(share)) + 6 * jnp.log(sigma)
 
 
-def narrow_bound(start: SE3, problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
-    """The motion near `start` and the noise bound that the residuals speak for: the given one, a half or a quarter.
+def narrow_bound(
+    versions: SE3, usable: Bool[Array, " f"], problem: Problem, config: RegisterConfig
+) -> tuple[SE3, Float[Array, ""]]:
+    """The best of the motion's versions and the noise bound that its residuals speak for: given, half or a quarter.
 
-    A bound that is too wide lets near misses in; one that is too narrow is not widened, since near misses would look
-    the same.
+    `versions` [f] of one motion, those that count `usable`. A bound that is too wide lets near misses in; one that is
+    too narrow is not widened, since near misses would look the same.
     """
+    moments = alignment_moments(problem.src, problem.dst)
 
-    def step(motion, factor):
-        level = problem.at_bound(problem.bound * factor)
-        motion = approach(motion, level, isotropic_whitener(level), config.approach_steps)
-        return motion, motion
+    def level(motions, factor):
+        at_level = problem.at_bound(problem.bound * factor)
+
+        def step(_, motions):
+            return reweighted(motions, at_level, moments, probability_within)
+
+        motions = jax.lax.fori_loop(0, config.level_steps, step, motions)
+        best = jnp.argmax(jnp.where(usable, score(motions, at_level), -1))
+        return motions, motions[best]
 
     factors = jnp.asarray(_FACTORS, problem.src.dtype)
-    _, motions = jax.lax.scan(step, start, factors)
+    _, motions = jax.lax.scan(level, versions, factors)
     norms = jnp.sqrt(squared_residuals(motions.rotmat(), motions.xyz, problem.src, problem.dst))
     window = _WINDOW * problem.bound
     seen = jnp.where(norms[0] < window, problem.weights, 0)
