@@ -7,16 +7,16 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jax.lax import Precision
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from ltgs_jax.geometry import SE3
 
-from .hypotheses import Hypotheses, Problem, score, search
+from .hypotheses import Problem, score, search
+from .noise import LEVELS
 from .outcome import Effort, RegisterConfig
 
-# Bounds, in units of the one searched at, at which finalists are compared: of two motions whose exact pairs tie, the
-# one with more near pairs is the larger.
-_COMPARED = (1.0, 2.0, 4.0)
+# Bounds, in units of the given one, at which finalists are compared, the given one first.
+_COMPARED = (1.0, 2.0, 4.0, 0.5, 0.25)
 # Finalists that move the points by less than this many bounds (rms) are one motion, found more or less exactly.
 _SAME = 4.0
 # Any two correspondences that keep their distance agree on a motion, and a third agrees with them soon.
@@ -30,15 +30,14 @@ _NULL_SPREAD = (0.09, 0.1)
 
 
 class Consensus(eqx.Module):
-    """The best motion at the noise bound at which it stands out most from chance, in several versions.
+    """The motion that stands out most from chance, and the noise bound at which it does.
 
-    `motions` [f] what the search ended with, of which `same` are versions of the best, its score first among them;
-    `distinction` how far that score lies above the best one of the same search on permuted correspondences, in units of
-    the latter's spread; `null` the latter.
+    `motions` its best versions at the bound and at the narrower `LEVELS` of it; `distinction` how far its score lies
+    above the best one of the same search on permuted correspondences, in units of the latter's spread; `null` the
+    latter.
     """
 
     motions: SE3
-    same: Bool[Array, " f"]
     distinction: Float[Array, ""]
     null: Float[Array, ""]
     bound: Float[Array, ""]
@@ -79,28 +78,39 @@ def displacements(motions: SE3, problem: Problem) -> Float[Array, "f f"]:
     return jnp.sqrt(jnp.maximum(squared + jnp.sum((moved[:, None] - moved[None]) ** 2, axis=-1), 0))
 
 
+def _scores(motions: SE3, problem: Problem, factors: tuple[float, ...]) -> Float[Array, "b f"]:
+    """Scores of every motion at several factors of the bound."""
+    bounds = problem.bound * jnp.asarray(factors, problem.src.dtype)
+    return jax.lax.map(lambda bound: score(motions, problem.at_bound(bound)), bounds)
+
+
 def _attempt(problem: Problem, key: PRNGKeyArray, effort: Effort, config: RegisterConfig) -> Consensus:
-    """Search at one bound, on the correspondences and on permuted ones, by one program."""
-
-    def run(pair: Problem) -> tuple[Hypotheses, Float[Array, "b f"]]:
-        found = search(pair, effort, config)
-        bounds = pair.bound * jnp.asarray(_COMPARED, pair.src.dtype)
-        return found, jax.lax.map(lambda bound: score(found.motion, pair.at_bound(bound)), bounds)
-
+    """Search, on the correspondences and on permuted ones, by one program."""
+    start = jnp.asarray(effort.bound_factors, problem.src.dtype)
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), problem, permuted(problem, key))
-    found, scores = jax.lax.map(run, both)
+    every = jax.tree.map(lambda leaf: jnp.repeat(leaf, start.size, axis=0), both)
+    every = every.at_bound(every.bound * jnp.tile(start, 2))
+    found = jax.lax.map(lambda pair: search(pair, effort, config).motion, every)
+    found = jax.tree.map(lambda leaf: leaf.reshape(2, -1, leaf.shape[-1]), found)
+    scores = jax.lax.map(lambda pair: _scores(*pair, _COMPARED), (found, both))
     null = jnp.maximum(jnp.max(scores[1], axis=1), _LEAST_NULL * vote(problem))
     above = distinction(scores[0], null[:, None], vote(problem))
-    motions = jax.tree.map(lambda leaf: leaf[0], found.motion)
-    near = displacements(motions, problem) < _SAME * problem.bound
-    # Where a motion is, its exact pairs say; which of two motions it is, all near pairs of all its versions.
-    rivals = above[0] >= _RIVAL * jnp.max(above[0])
-    leader = jnp.argmax(jnp.where(rivals, jnp.sum(above, axis=0), -jnp.inf))
-    same = near[leader].at[leader].set(True)
-    standing = jnp.where(same, above[0], -jnp.inf)
-    # The best versions first, as many as every effort has.
-    kept, order = jax.lax.top_k(standing, min(config.versions, standing.size))
-    return Consensus(motions[order], jnp.isfinite(kept), kept[0], null[0], problem.bound)
+    motions = found[0]
+    # The caller had a reason for the given bound.
+    handicap = jnp.full(len(_COMPARED), _CHANGE).at[0].set(0)[:, None]
+    heard = jnp.max(above, axis=1, keepdims=True)
+    standing = jnp.max(above - handicap, axis=0)
+    # Which of two motions it is, all bounds say at which anything stands out; where it is, the exact pairs.
+    rivals = standing >= _RIVAL * jnp.max(standing)
+    votes = jnp.sum(jnp.where(heard >= _RIVAL * jnp.max(heard), above, 0), axis=0)
+    leader = jnp.argmax(jnp.where(rivals, votes, -jnp.inf))
+    near = displacements(motions, problem)[leader] < _SAME * problem.bound
+    same = near.at[leader].set(True)
+    clear = jnp.max(jnp.where(same, above, -jnp.inf), axis=1)
+    level = jnp.where(clear[0] >= config.settle, 0, jnp.argmax(clear - handicap[:, 0]))
+    bound = problem.bound * jnp.asarray(_COMPARED, problem.src.dtype)[level]
+    exact = jnp.argmax(jnp.where(same, _scores(motions, problem.at_bound(bound), LEVELS), -jnp.inf), axis=1)
+    return Consensus(motions[exact], (clear - handicap[:, 0])[level], null[level], bound)
 
 
 def _sweep(first: Consensus, problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:

@@ -2,17 +2,17 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ltgs_jax.geometry import SE3
 
 from .align import alignment_moments, squared_residuals
-from .hypotheses import Problem, reweighted, score
+from .hypotheses import Problem, reweighted
 from .outcome import RegisterConfig
 from .refine import BOUND_IN_SIGMA, probability_within
 
-# Levels that are weighed against each other, the given bound first; each starts from the one before.
-_FACTORS = (1.0, 0.5, 0.25)
+# Shares of the bound that are weighed against each other, the bound itself first.
+LEVELS = (1.0, 0.5, 0.25)
 # Window of the comparison, in units of the given bound: beyond it every level sees outliers alone.
 _WINDOW = 2.0
 # Nats by which a narrower level must beat the given one, which the caller had a reason for.
@@ -49,32 +49,23 @@ def log_evidence(
     return jnp.sum(weights * mixture(share)) + 6 * jnp.log(sigma)
 
 
-def narrow_bound(
-    versions: SE3, usable: Bool[Array, " f"], problem: Problem, config: RegisterConfig
-) -> tuple[SE3, Float[Array, ""]]:
-    """The best of the motion's versions and the noise bound that its residuals speak for: given, half or a quarter.
+def narrow_bound(versions: SE3, problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
+    """The motion, and the noise bound that the residuals speak for: the given one, a half or a quarter.
 
-    `versions` [f] of one motion, those that count `usable`. A bound that is too wide lets near misses in; one that is
-    too narrow is not widened, since near misses would look the same.
+    `versions` [3] the best at each. A bound that is too wide lets near misses in; one that is too narrow is not
+    widened, since near misses would look the same.
     """
     moments = alignment_moments(problem.src, problem.dst)
+    factors = jnp.asarray(LEVELS, problem.src.dtype)
+    bounds = problem.bound * factors
 
-    def level(motions, factor):
-        at_level = problem.at_bound(problem.bound * factor)
+    def step(_, motions):
+        return reweighted(motions, problem, moments, lambda q: probability_within(q / factors[:, None] ** 2))
 
-        def step(_, motions):
-            return reweighted(motions, at_level, moments, probability_within)
-
-        motions = jax.lax.fori_loop(0, config.level_steps, step, motions)
-        best = jnp.argmax(jnp.where(usable, score(motions, at_level), -1))
-        return motions, motions[best]
-
-    factors = jnp.asarray(_FACTORS, problem.src.dtype)
-    _, motions = jax.lax.scan(level, versions, factors)
+    motions = jax.lax.fori_loop(0, config.level_steps, step, versions)
     norms = jnp.sqrt(squared_residuals(motions.rotmat(), motions.xyz, problem.src, problem.dst))
     window = _WINDOW * problem.bound
     seen = jnp.where(norms[0] < window, problem.weights, 0)
-    sigmas = factors * problem.bound / BOUND_IN_SIGMA
-    evidence = jax.vmap(lambda r, sigma: log_evidence(r, seen, sigma, window))(norms, sigmas)
+    evidence = jax.vmap(lambda r, bound: log_evidence(r, seen, bound / BOUND_IN_SIGMA, window))(norms, bounds)
     best = jnp.argmax(evidence.at[0].add(_TRUST))
-    return motions[best], problem.bound * factors[best]
+    return motions[best], bounds[best]

@@ -66,7 +66,7 @@ def lift_covariance(
 def _fit(consensus: Consensus, problem: Problem, frozen: Problem, covariances, config: RegisterConfig):
     """Robust least squares from the consensus: motion, problem at its bound, whitener, whether it converged."""
     if covariances is None:
-        start, bound = narrow_bound(consensus.motions, consensus.same, frozen, config)
+        start, bound = narrow_bound(consensus.motions, frozen, config)
         problem, level = problem.at_bound(bound), frozen.at_bound(bound)
         whitener = isotropic_whitener(problem)
         start = approach(start, level, isotropic_whitener(level), config.approach_steps)
