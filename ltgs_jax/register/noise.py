@@ -17,7 +17,8 @@ LEVELS = (1.0, 0.5, 0.25)
 _WINDOW = 2.0
 # Nats by which a narrower level must beat the given one, which the caller had a reason for.
 _TRUST = 6.0
-_EM_STEPS = 10
+_EM_STEPS = 12
+_LEAST_SHARE = 1e-3
 
 
 def _log_gaussian_norm(r: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[Array, " n"]:
@@ -27,33 +28,40 @@ def _log_gaussian_norm(r: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[
 
 
 def log_evidence(
-    norms: Float[Array, " n"], weights: Float[Array, " n"], sigma: Float[Array, ""], window: Float[Array, ""]
+    norms: Float[Array, " n"],
+    weights: Float[Array, " n"],
+    sigma: Float[Array, ""],
+    halo: Float[Array, ""],
+    window: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Log evidence of noise σ in residual norms within a window, among outliers spread evenly over a surface.
+    """Log evidence of a core of noise σ in residual norms within a window.
 
-    Σ w·log(p·χ₃(r/σ) + (1 − p)·2r/window²) at its best share p, and 6·log σ for the room of the six fitted parameters
-    (Laplace). `weights` 0 outside the window.
+    What is not of the core is of a halo (near misses, noise `halo`), or an outlier spread evenly over a surface:
+    Σ w·log(p·χ₃(r/σ) + q·χ₃(r/halo) + (1 − p − q)·2r/window²) at its best shares, and 6·log σ for the room of the six
+    fitted parameters (Laplace). `weights` 0 outside the window.
     """
     r = jnp.clip(norms, jnp.finfo(norms.dtype).eps * window, window)
-    inlier, outlier = _log_gaussian_norm(r, sigma), jnp.log(2 * r) - 2 * jnp.log(window)
+    outlier = jnp.log(2 * r) - 2 * jnp.log(window)
+    logs = jnp.stack([_log_gaussian_norm(r, sigma), _log_gaussian_norm(r, halo), outlier])
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(norms.dtype).tiny)
 
-    def mixture(share):
-        return jnp.logaddexp(jnp.log(share) + inlier, jnp.log1p(-share) + outlier)
+    def mixture(shares):
+        return jax.nn.logsumexp(jnp.log(shares)[:, None] + logs, axis=0)
 
-    def step(_, share):
-        posterior = jnp.exp(jnp.log(share) + inlier - mixture(share))
-        return jnp.clip(jnp.sum(weights * posterior) / total, 0.01, 0.99)
+    def step(_, shares):
+        posterior = jnp.exp(jnp.log(shares)[:, None] + logs - mixture(shares))
+        shares = jnp.maximum(jnp.sum(weights * posterior, axis=1) / total, _LEAST_SHARE)
+        return shares / jnp.sum(shares)
 
-    share = jax.lax.fori_loop(0, _EM_STEPS, step, jnp.asarray(0.5, norms.dtype))
-    return jnp.sum(weights * mixture(share)) + 6 * jnp.log(sigma)
+    shares = jax.lax.fori_loop(0, _EM_STEPS, step, jnp.full(3, 1 / 3, norms.dtype))
+    return jnp.sum(weights * mixture(shares)) + 6 * jnp.log(sigma)
 
 
 def narrow_bound(versions: SE3, problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
     """The motion, and the noise bound that the residuals speak for: the given one, a half or a quarter.
 
-    `versions` [3] the best at each. A bound that is too wide lets near misses in; one that is too narrow is not
-    widened, since near misses would look the same.
+    `versions` [3] the best at each. A bound that is too wide lets near misses in, unless a core of exact pairs stands
+    out; one that is too narrow is not widened, since near misses would look the same.
     """
     moments = alignment_moments(problem.src, problem.dst)
     factors = jnp.asarray(LEVELS, problem.src.dtype)
@@ -66,6 +74,7 @@ def narrow_bound(versions: SE3, problem: Problem, config: RegisterConfig) -> tup
     norms = jnp.sqrt(squared_residuals(motions.rotmat(), motions.xyz, problem.src, problem.dst))
     window = _WINDOW * problem.bound
     seen = jnp.where(norms[0] < window, problem.weights, 0)
-    evidence = jax.vmap(lambda r, bound: log_evidence(r, seen, bound / BOUND_IN_SIGMA, window))(norms, bounds)
+    sigmas = bounds / BOUND_IN_SIGMA
+    evidence = jax.vmap(lambda r, sigma: log_evidence(r, seen, sigma, sigmas[0], window))(norms, sigmas)
     best = jnp.argmax(evidence.at[0].add(_TRUST))
     return motions[best], bounds[best]
