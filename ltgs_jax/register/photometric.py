@@ -254,7 +254,7 @@ def _descend(template, poses, patches: _Patches, size, reach, steps, *, plan: Re
             trial=_pick(done | restart, best.pose, best.pose @ SE3.exp(step)),
             damping=jnp.where(restart, _DAMPING, damping),
             done=done,
-            tried=state.tried + ~state.done,
+            tried=state.tried + (~state.done).astype(jnp.int32),
             start_cost=jnp.where(state.step == 0, point.cost, state.start_cost),
             overflow=state.overflow + overflow,
         )
