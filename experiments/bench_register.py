@@ -9,6 +9,7 @@ row is on disk: the same command again goes on where it stopped. `bunny.npy`-lik
 import importlib.util
 import itertools
 import json
+import resource
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -132,8 +133,10 @@ def run_bounds(options: Options, problems, table: Table) -> None:
     for suite, cell in BOUND_CELLS:
         for factor in (0.25, 0.5, 1.0, 2.0, 4.0):
             key = {"part": "bounds", "solver": "ltgs", "suite": suite, "cell": list(cell), "factor": factor}
-            if not table.has(**key):
-                row = measure(problems, solvers.SOLVERS["ltgs"], suite, cell, range(options.trials), factor)
+            key["first"] = options.first
+            if options.match in str(cell) and not table.has(**key):
+                trials = range(options.first, options.first + options.trials)
+                row = measure(problems, solvers.SOLVERS["ltgs"], suite, cell, trials, factor)
                 table.add(key | row)
 
 
@@ -156,42 +159,58 @@ def run_times(options: Options, problems, table: Table) -> None:
             cpus.append(time.process_time() - cpu)
         cosine = np.clip((np.trace(np.asarray(answer.dst_from_src.rotmat()).T @ rotmat) - 1) / 2, -1, 1)
         row = {"first_s": first, "wall_ms": 1e3 * min(walls), "cpu_ms": 1e3 * min(cpus)}
+        row |= {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
         table.add(key | row | {"rotation_deg": float(np.degrees(np.arccos(cosine)))})
+
+
+BATCH_CELLS = (("P4", (200, 25, 20)), ("P4", (200, 40, 30)), ("P3", ("mug", 200)), ("P6", (200, 20, 50)))
 
 
 def run_batch(options: Options, problems, table: Table) -> None:
     """64 problems of N = 200 in one vmapped call, against as many single calls."""
-    del options
-    cell = (200, 25, 20)
-    if table.has(part="batch", cell=list(cell)):
-        return
-    cases = [problems.gen("P4", cell, trial) for trial in range(64)]
+    for suite, cell in BATCH_CELLS:
+        key = {"part": "batch", "suite": suite, "cell": list(cell), "problems": 64}
+        if options.match in str(cell) and not table.has(**key):
+            table.add(key | measure_batch(problems, [problems.gen(suite, cell, trial) for trial in range(64)]))
+
+
+@jax.jit
+def _solve_batch(src, dst, bound):
+    return jax.vmap(lambda a, b: register(a, b, noise_bound=bound))(src, dst)
+
+
+def measure_batch(problems, cases: list[dict]) -> dict:
+    """Success and time of one vmapped call, and of one call after the other by each solver."""
     bound = NOISE_BOUND * cases[0]["sigma"]
     src, dst = (jnp.asarray(np.stack([case[name] for case in cases]), jnp.float32) for name in ("src", "dst"))
-    solve = jax.jit(jax.vmap(lambda a, b: register(a, b, noise_bound=bound)))
     start = time.perf_counter()
-    answer = jax.block_until_ready(solve(src, dst))
-    first = time.perf_counter() - start
+    answer = jax.block_until_ready(_solve_batch(src, dst, bound))
+    row = {"first_s": time.perf_counter() - start}
     walls, cpus = [], []
-    for _ in range(7):
+    for _ in range(5):
         wall, cpu = time.perf_counter(), time.process_time()
-        answer = jax.block_until_ready(solve(src, dst))
+        answer = jax.block_until_ready(_solve_batch(src, dst, bound))
         walls.append(time.perf_counter() - wall)
         cpus.append(time.process_time() - cpu)
+    row |= {"wall_ms": 1e3 * min(walls), "cpu_ms": 1e3 * min(cpus)}
     poses = np.asarray(answer.dst_from_src.as_matrix(), np.float64)
-    errors = [problems.errors(case, pose[:3, :3], pose[:3, 3]) for case, pose in zip(cases, poses, strict=True)]
-    right = np.mean([angle < ANGLE and shift < SHIFT for angle, shift in errors])
-    row = {"part": "batch", "suite": "P4", "cell": list(cell), "problems": 64, "success": float(right)}
-    row |= {"first_s": first, "wall_ms": 1e3 * min(walls), "cpu_ms": 1e3 * min(cpus)}
+    row["success"] = share_right(problems, cases, [(pose[:3, :3], pose[:3, 3]) for pose in poses])
     for name in ("ltgs", "pycolmap"):
+        solvers.SOLVERS[name](cases[0], bound)
         wall, cpu = time.perf_counter(), time.process_time()
-        for case in cases:
-            solvers.SOLVERS[name](case, bound)
+        found = [solvers.SOLVERS[name](case, bound)[:2] for case in cases]
         row |= {
             f"{name}_wall_ms": 1e3 * (time.perf_counter() - wall),
             f"{name}_cpu_ms": 1e3 * (time.process_time() - cpu),
+            f"{name}_success": share_right(problems, cases, found),
         }
-    table.add(row)
+    return row
+
+
+def share_right(problems, cases: list[dict], found: list[tuple[np.ndarray, np.ndarray]]) -> float:
+    """Share of answers within the limits."""
+    errors = [problems.errors(case, *pose) for case, pose in zip(cases, found, strict=True)]
+    return float(np.mean([angle < ANGLE and shift < SHIFT for angle, shift in errors]))
 
 
 def run_inner(options: Options, problems, table: Table) -> None:
@@ -212,7 +231,7 @@ def draw(options: Options, table: Table) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
-    cells = [row for row in table.rows if row["part"] == "cells"]
+    cells = [row for row in table.rows if row["part"] == "cells" and row["first"] == options.first]
     for name in dict.fromkeys(row["solver"] for row in cells):
         rows = [row for row in cells if row["solver"] == name and row["suite"] == "P1"]
         rows = sorted((row for row in rows if row["cell"][:2] == [1000, "onobj"]), key=lambda row: row["cell"][2])
@@ -229,7 +248,7 @@ def draw(options: Options, table: Table) -> None:
     times = sorted((row for row in table.rows if row["part"] == "times"), key=lambda row: row["count"])
     axes[0, 1].loglog([r["count"] for r in times], [r["cpu_ms"] for r in times], marker="o")
     axes[0, 1].set(title="90 % outliers", xlabel="correspondences", ylabel="CPU time, ms")
-    ours = [row for row in cells if row["solver"] == "ltgs" and "confidence" in row]
+    ours = [row for row in table.rows if row["part"] == "cells" and row["solver"] == "ltgs"]
     trust = np.concatenate([row["confidence"] for row in ours]) if ours else np.zeros(0)
     right = np.concatenate([row["right"] for row in ours]).astype(float) if ours else np.zeros(0)
     edges = np.array([0, 0.05, 0.2, 0.5, 0.8, 0.95, 1.0001])

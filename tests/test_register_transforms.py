@@ -10,7 +10,7 @@ from ltgs_jax.geometry import SE3
 from ltgs_jax.register import register
 from ltgs_jax.register.align import align, alignment_moments
 from ltgs_jax.register.hypotheses import BLOCK, Problem, search
-from ltgs_jax.register.outcome import RegisterConfig
+from ltgs_jax.register.outcome import Effort, RegisterConfig
 
 
 def test_a_batch_gives_the_answers_of_its_problems():
@@ -86,11 +86,11 @@ def test_blocks_of_columns_change_nothing(monkeypatch):
     """The hypotheses of a problem in blocks are those of the whole matrix."""
     src, dst, *_ = problem(9, 256, 0.8)
     whole = Problem(*(jnp.asarray(x, jnp.float32) for x in (src, dst, np.ones(256))), jnp.float32(0.017))
-    config = RegisterConfig(seeds=32)
-    expected = search(whole, config)
+    effort, config = Effort(points=32, pairs=0, finalists=16, bound_factors=(1.0,)), RegisterConfig()
+    expected = search(whole, effort, config)
     assert BLOCK > 256
     monkeypatch.setattr("ltgs_jax.register.hypotheses.BLOCK", 64)
-    blocked = search(whole, config)
+    blocked = search(whole, effort, config)
     np.testing.assert_allclose(np.sort(blocked.score), np.sort(expected.score), atol=1e-2)
 
 

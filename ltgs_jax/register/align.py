@@ -15,33 +15,47 @@ def alignment_moments(src: Float[Array, "n 3"], dst: Float[Array, "n 3"]) -> Flo
     return jnp.concatenate([jnp.ones_like(src[:, :1]), src, dst, cross], axis=-1)
 
 
-def _horn_matrix(h: Float[Array, "... 3 3"]) -> Float[Array, "... 4 4"]:
-    """Symmetric matrix whose leading eigenvector is the wxyz quaternion of d ≈ R·s, from H = Σ s dᵀ (Horn 1987)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = [[h[..., i, j] for j in range(3)] for i in range(3)]
-    rows = [
+def _horn_matrix(h: list[list[Float[Array, " s"]]]) -> list[list[Float[Array, " s"]]]:
+    """Upper triangle of the symmetric 4×4 matrix whose leading eigenvector is the wxyz quaternion of d ≈ R·s.
+
+    From H = Σ s dᵀ (Horn 1987), one array per entry: small matrices vectorise over hypotheses, not inside.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = h
+    return [
         [xx + yy + zz, yz - zy, zx - xz, xy - yx],
-        [yz - zy, xx - yy - zz, xy + yx, zx + xz],
-        [zx - xz, xy + yx, yy - xx - zz, yz + zy],
-        [xy - yx, zx + xz, yz + zy, zz - xx - yy],
+        [xx - yy - zz, xy + yx, zx + xz],
+        [yy - xx - zz, yz + zy],
+        [zz - xx - yy],
     ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _leading_quat(matrix: Float[Array, "... 4 4"]) -> Float[Array, "... 4"]:
+def _leading_quat(upper: list[list[Float[Array, " s"]]]) -> list[Float[Array, " s"]]:
     """Unit eigenvector of the largest eigenvalue, by squaring of the matrix shifted to be positive."""
-    tiny = jnp.finfo(matrix.dtype).tiny
-    norm = jnp.sqrt(jnp.sum(matrix * matrix, axis=(-2, -1), keepdims=True))
-    eye = jnp.eye(4, dtype=matrix.dtype)
-    shifted = jnp.where(norm > tiny, matrix / jnp.maximum(norm, tiny), 0) + eye
+    places = [(i, j) for i in range(4) for j in range(i, 4)]
+    entries = {(i, j): upper[i][j - i] for i, j in places}
+    tiny = jnp.finfo(entries[0, 0].dtype).tiny
+    norm = jnp.sqrt(sum((1 if i == j else 2) * entries[i, j] ** 2 for i, j in places))
+    scale = jnp.where(norm > tiny, 1 / jnp.maximum(norm, tiny), 0)
+    start = tuple(entries[i, j] * scale + (1 if i == j else 0) for i, j in places)
+
+    def full(power):
+        at = dict(zip(places, power, strict=True))
+        return [[at[min(i, j), max(i, j)] for j in range(4)] for i in range(4)]
 
     def square(_, power):
-        power = jnp.sum(power[..., :, :, None] * power[..., None, :, :], axis=-2)
-        return power / jnp.trace(power, axis1=-2, axis2=-1)[..., None, None]
+        m = full(power)
+        squared = [sum(m[i][k] * m[k][j] for k in range(4)) for i, j in places]
+        trace = sum(value for value, (i, j) in zip(squared, places, strict=True) if i == j)
+        return tuple(value / trace for value in squared)
 
-    power = jax.lax.fori_loop(0, _SQUARINGS, square, shifted)
-    best = jnp.argmax(jnp.diagonal(power, axis1=-2, axis2=-1), axis=-1)
-    column = jnp.take_along_axis(power, best[..., None, None], axis=-1)[..., 0]
-    return column / jnp.sqrt(jnp.sum(column * column, axis=-1, keepdims=True))
+    m = full(jax.lax.fori_loop(0, _SQUARINGS, square, start))
+    column, largest = [m[i][0] for i in range(4)], m[0][0]
+    for k in range(1, 4):
+        larger = m[k][k] > largest
+        column = [jnp.where(larger, m[i][k], c) for i, c in enumerate(column)]
+        largest = jnp.where(larger, m[k][k], largest)
+    length = jnp.sqrt(sum(c * c for c in column))
+    return [c / length for c in column]
 
 
 def align(
@@ -52,12 +66,12 @@ def align(
     Points on a line or in one point give one of the equally good rotations, never a reflection.
     """
     sums = jnp.matmul(weights, moments, precision=Precision.HIGHEST)
-    total = jnp.maximum(sums[:, :1], jnp.finfo(sums.dtype).tiny)
-    means = sums[:, 1:] / total
-    src_mean, dst_mean = means[:, :3], means[:, 3:6]
-    spread = means[:, 6:].reshape(-1, 3, 3) - src_mean[:, :, None] * dst_mean[:, None, :]
-    quats = _leading_quat(_horn_matrix(spread))
-    return quats, dst_mean - rotate(quats, src_mean)
+    total = jnp.maximum(sums[:, 0], jnp.finfo(sums.dtype).tiny)
+    means = [sums[:, k] / total for k in range(1, 16)]
+    src_mean, dst_mean = means[:3], means[3:6]
+    spread = [[means[6 + 3 * i + j] - src_mean[i] * dst_mean[j] for j in range(3)] for i in range(3)]
+    quats = jnp.stack(_leading_quat(_horn_matrix(spread)), axis=-1)
+    return quats, jnp.stack(dst_mean, axis=-1) - rotate(quats, jnp.stack(src_mean, axis=-1))
 
 
 def rotate(quats: Float[Array, "s 4"], points: Float[Array, "s 3"]) -> Float[Array, "s 3"]:

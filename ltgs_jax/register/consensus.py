@@ -1,18 +1,25 @@
 """The motion that most correspondences agree on, over a range of noise bounds, against what chance can do."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import sequential_vmap
+from jax.lax import Precision
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from ltgs_jax.geometry import SE3
 
-from .hypotheses import Hypotheses, Problem, polish, rescore, score, search
-from .outcome import RegisterConfig
+from .hypotheses import Problem, score, search
+from .noise import LEVELS
+from .outcome import Effort, RegisterConfig
 
-# Bounds, in units of the one searched at, at which finalists are compared: of two motions whose exact pairs tie, the
-# one with more near pairs is the larger.
-_COMPARED = (1.0, 2.0, 4.0)
+# Bounds, in units of the given one, at which finalists are compared, the given one first.
+_COMPARED = (1.0, 2.0, 4.0, 0.5, 0.25)
+# Finalists that move the points by less than this many bounds (rms) are one motion, found more or less exactly.
+_SAME = 4.0
 # Any two correspondences that keep their distance agree on a motion, and a third agrees with them soon.
 _LEAST_NULL = 2.5
 # Distinction by which another bound must beat the one before: the null has its own luck.
@@ -24,17 +31,17 @@ _NULL_SPREAD = (0.09, 0.1)
 
 
 class Consensus(eqx.Module):
-    """The best motion at the noise bound at which it stands out most from chance.
+    """The motion that stands out most from chance, and the noise bound at which it does.
 
-    `distinction` how far its score lies above the best one of the same search on permuted correspondences, in units of
-    that score's spread; `null` the latter; `found` every hypothesis at that bound.
+    `motions` its best versions at the bound and at the narrower `LEVELS` of it; `distinction` how far its score lies
+    above the best one of the same search on permuted correspondences, in units of the latter's spread; `null` the
+    latter.
     """
 
-    motion: SE3
+    motions: SE3
     distinction: Float[Array, ""]
     null: Float[Array, ""]
     bound: Float[Array, ""]
-    found: Hypotheses
 
 
 def permuted(problem: Problem, key: PRNGKeyArray) -> Problem:
@@ -58,50 +65,102 @@ def vote(problem: Problem) -> Float[Array, ""]:
     return jnp.where(most > 0, most, 1)
 
 
-def _attempt(problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
-    """Search at one bound, on the correspondences and on permuted ones, by one program."""
+def displacements(motions: SE3, problem: Problem) -> Float[Array, "f f"]:
+    """Root mean square distance between the usable points as moved by each two motions."""
+    usable = (problem.weights > 0).astype(problem.src.dtype)
+    total = jnp.maximum(jnp.sum(usable), 1)
+    mean = jnp.sum(usable[:, None] * problem.src, axis=0) / total
+    centred = usable[:, None] * (problem.src - mean)
+    spread = jnp.matmul(centred.T, centred, precision=Precision.HIGHEST) / total
+    rotmats = motions.rotmat()
+    moved = motions.xyz + jnp.einsum("fij,j->fi", rotmats, mean, precision=Precision.HIGHEST)
+    turn = rotmats[:, None] - rotmats[None]
+    squared = jnp.einsum("abij,jk,abik->ab", turn, spread, turn, precision=Precision.HIGHEST)
+    return jnp.sqrt(jnp.maximum(squared + jnp.sum((moved[:, None] - moved[None]) ** 2, axis=-1), 0))
 
-    def run(pair: Problem) -> tuple[Hypotheses, SE3, Float[Array, "b s"]]:
-        found = search(pair, config)
-        motion = polish(found, pair, config).motion
-        bounds = pair.bound * jnp.asarray(_COMPARED, pair.src.dtype)
-        return found, motion, jax.lax.map(lambda bound: score(motion, pair.at_bound(bound)), bounds)
 
+def _scores(motions: SE3, problem: Problem, factors: tuple[float, ...]) -> Float[Array, "b f"]:
+    """Scores of every motion at several factors of the bound."""
+    bounds = problem.bound * jnp.asarray(factors, problem.src.dtype)
+    return jax.lax.map(lambda bound: score(motions, problem.at_bound(bound)), bounds)
+
+
+def _attempt(problem: Problem, key: PRNGKeyArray, effort: Effort, config: RegisterConfig) -> Consensus:
+    """Search, on the correspondences and on permuted ones, by one program."""
+    start = jnp.asarray(effort.bound_factors, problem.src.dtype)
     both = jax.tree.map(lambda a, b: jnp.stack([a, b]), problem, permuted(problem, key))
-    found, motions, scores = jax.lax.map(run, both)
+    every = jax.tree.map(lambda leaf: jnp.repeat(leaf, start.size, axis=0), both)
+    every = every.at_bound(every.bound * jnp.tile(start, 2))
+    found = jax.lax.map(lambda pair: search(pair, effort, config).motion, every)
+    found = jax.tree.map(lambda leaf: leaf.reshape(2, -1, leaf.shape[-1]), found)
+    scores = jax.lax.map(lambda pair: _scores(*pair, _COMPARED), (found, both))
     null = jnp.maximum(jnp.max(scores[1], axis=1), _LEAST_NULL * vote(problem))
     above = distinction(scores[0], null[:, None], vote(problem))
-    rivals = above[0] >= _RIVAL * jnp.max(above[0])
-    best = jnp.argmax(jnp.where(rivals, jnp.sum(above, axis=0), -jnp.inf))
-    return Consensus(motions[0, best], above[0, best], null[0], problem.bound, jax.tree.map(lambda x: x[0], found))
+    motions = found[0]
+    # The caller had a reason for the given bound; at bounds that were not searched, scores do but tell motions apart.
+    handicap = np.where(np.isin(_COMPARED, effort.bound_factors), _CHANGE, np.inf)
+    handicap = jnp.asarray(np.where(np.equal(_COMPARED, 1), 0, handicap), problem.src.dtype)[:, None]
+    heard = jnp.max(above, axis=1, keepdims=True)
+    standing = jnp.max(above - handicap, axis=0)
+    # Which of two motions it is, all bounds say at which anything stands out; where it is, the exact pairs.
+    rivals = standing >= _RIVAL * jnp.max(standing)
+    votes = jnp.sum(jnp.where(heard >= _RIVAL * jnp.max(heard), above, 0), axis=0)
+    leader = jnp.argmax(jnp.where(rivals, votes, -jnp.inf))
+    near = displacements(motions, problem)[leader] < _SAME * problem.bound
+    same = near.at[leader].set(True)
+    clear = jnp.max(jnp.where(same, above, -jnp.inf), axis=1)
+    level = jnp.where(clear[0] >= config.settle, 0, jnp.argmax(clear - handicap[:, 0]))
+    bound = problem.bound * jnp.asarray(_COMPARED, problem.src.dtype)[level]
+    exact = jnp.argmax(jnp.where(same, _scores(motions, problem.at_bound(bound), LEVELS), -jnp.inf), axis=1)
+    return Consensus(motions[exact], (clear - handicap[:, 0])[level], null[level], bound)
 
 
-def find_consensus(problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
-    """Consensus at the given bound, or, where that does not stand out, at the factor of it where it does most.
-
-    The sweep ends at the first bound with the distinction `settle`.
-    """
+def _sweep(first: Consensus, problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
+    """Thorough searches at the factors of the noise bound in turn, until one stands out."""
     factors = jnp.asarray(config.bound_factors, problem.src.dtype)
 
     def unsettled(state):
         step, best = state
-        return (step < factors.size) & ((step == 0) | (best.distinction < config.settle))
+        return (step < factors.size) & (best.distinction < config.settle)
 
     def attempt(state):
         step, best = state
-        new = _attempt(problem.at_bound(problem.bound * factors[step]), key, config)
+        new = _attempt(problem.at_bound(problem.bound * factors[step]), key, config.thorough, config)
         better = (step == 0) | (new.distinction > best.distinction + _CHANGE)
         return step + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
 
-    shape = jax.eval_shape(lambda: _attempt(problem, key, config))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    _, best = jax.lax.while_loop(unsettled, attempt, (jnp.asarray(0), nothing))
-    return best
+    return jax.lax.while_loop(unsettled, attempt, (jnp.asarray(0), first))[1]
 
 
-def find_second(
-    consensus: Consensus, problem: Problem, remaining: Float[Array, " n"], config: RegisterConfig
-) -> tuple[SE3, Float[Array, ""]]:
-    """The motion that the `remaining` weights agree on most, and its score."""
-    rest = Problem(problem.src, problem.dst, remaining, consensus.bound)
-    return polish(rescore(consensus.found.motion, rest), rest, config).best()
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _sweep_where_needed(first: Consensus, problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
+    """`_sweep`; of a batch only the problems that need it, one after the other."""
+    return sequential_vmap(lambda *args: _sweep(*args, config))(first, problem, key)
+
+
+@_sweep_where_needed.defjvp
+def _no_tangent(config, primals, tangents):
+    del tangents
+    found = _sweep_where_needed(*primals, config)
+    return found, jax.tree.map(_zero_tangent, found)
+
+
+def _zero_tangent(leaf):
+    if jnp.issubdtype(leaf.dtype, jnp.inexact):
+        return jnp.zeros_like(leaf)
+    return jnp.zeros(leaf.shape, jax.dtypes.float0)
+
+
+def find_consensus(problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
+    """Consensus at the given bound by a quick search, or, where that does not stand out, by thorough ones.
+
+    The sweep over factors of the bound ends at the first with the distinction `settle`.
+    """
+    first = _attempt(problem, key, config.quick, config)
+    return _sweep_where_needed(first, problem, key, config)
+
+
+def find_second(problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
+    """The motion that most of the problem's weights agree on, by a quick search without a null, and its score."""
+    best = search(problem, config.quick, config).top(1)
+    return best.motion[0], best.score[0]

@@ -27,22 +27,41 @@ class Result(enum.IntEnum):
         }[self]
 
 
+class Effort(eqx.Module):
+    """How much a search looks at; all static."""
+
+    points: int = eqx.field(static=True)
+    """Most correspondences around which a local consensus set is grown."""
+    pairs: int = eqx.field(static=True)
+    """Most pairs around which one is grown, where correspondences are few."""
+    finalists: int = eqx.field(static=True)
+    """Hypotheses that are refined at the noise bound before one is chosen."""
+    bound_factors: tuple[float, ...] = eqx.field(static=True)
+    """Factors of the noise bound at which it looks."""
+
+
 class RegisterConfig(eqx.Module):
     """Options of `register`; all static."""
 
-    seeds: int = eqx.field(static=True, default=512)
-    """Most correspondences around which a local consensus set is grown."""
-    finalists: int = eqx.field(static=True, default=16)
-    """Hypotheses that are refined on all correspondences before one is chosen."""
+    quick: Effort = eqx.field(
+        static=True, default=Effort(points=32, pairs=0, finalists=6, bound_factors=(1.0, 4.0, 0.25))
+    )
+    """The first search; where its answer stands out from chance, the only one."""
+    thorough: Effort = eqx.field(
+        static=True, default=Effort(points=1024, pairs=512, finalists=16, bound_factors=(1.0,))
+    )
+    """The searches of what the first left open."""
     anneal: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 1.0))
     """Bounds of the Geman-McClure annealing of each hypothesis, in units of the noise bound."""
-    refine_steps: int = eqx.field(static=True, default=8)
+    refine_steps: int = eqx.field(static=True, default=6)
     """Reweighted closed-form steps of each finalist."""
     bound_factors: tuple[float, ...] = eqx.field(static=True, default=(1.0, 2.0, 0.5, 4.0, 0.25))
     """Factors of the noise bound that are tried in turn until one settles the matter."""
     settle: float = eqx.field(static=True, default=5.0)
     """Score above the null, in units of the null's spread, at which no further bound is tried."""
-    approach_steps: int = eqx.field(static=True, default=20)
+    level_steps: int = eqx.field(static=True, default=4)
+    """Reweighted closed-form steps at each noise level."""
+    approach_steps: int = eqx.field(static=True, default=5)
     """Reweighted Gauss-Newton steps of the winner before the final solve."""
     max_steps: int = eqx.field(static=True, default=64)
     """Levenberg-Marquardt steps of the final solve."""

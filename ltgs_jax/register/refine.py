@@ -31,10 +31,14 @@ def robust_residuals(whitened: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
     return factor[:, None] * whitened
 
 
+def probability_within(relative: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Weight of r²/bound² in the robust fit: its odds against the constant share of outliers."""
+    return jax.nn.sigmoid(0.5 * BOUND_IN_SIGMA**2 * (1 - relative))
+
+
 def inlier_probability(whitened: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Weight of each residual in the robust fit: its odds against the constant share of outliers."""
-    squared = jnp.sum(whitened * whitened, axis=-1)
-    return jax.nn.sigmoid(0.5 * (BOUND_IN_SIGMA**2 - squared))
+    """Weight of each residual, in units of σ, in the robust fit."""
+    return probability_within(jnp.sum(whitened * whitened, axis=-1) / BOUND_IN_SIGMA**2)
 
 
 def whitened_residuals(motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:

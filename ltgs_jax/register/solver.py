@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from ltgs_jax.geometry import SE3
 
 from .consensus import Consensus, distinction, find_consensus, find_second, vote
-from .hypotheses import BLOCK, Problem, score
+from .hypotheses import BLOCK, Problem
 from .noise import narrow_bound
 from .outcome import RegisterConfig, Registration, Result
 from .refine import (
@@ -25,6 +25,9 @@ from .refine import (
 )
 from .scale import refine_scale, vote_scale
 from .verdict import confidence, free_axis
+
+# Steps from the isotropic consensus to one by covariances, which may lie far apart.
+_WHITENED_STEPS = 20
 
 
 def _centre(points: Float[Array, "n 3"], usable: Float[Array, " n"]) -> Float[Array, "3"]:
@@ -63,13 +66,14 @@ def lift_covariance(
 def _fit(consensus: Consensus, problem: Problem, frozen: Problem, covariances, config: RegisterConfig):
     """Robust least squares from the consensus: motion, problem at its bound, whitener, whether it converged."""
     if covariances is None:
-        start, bound = narrow_bound(consensus.motion, frozen, config)
-        problem = problem.at_bound(bound)
+        start, bound = narrow_bound(consensus.motions, frozen, config)
+        problem, level = problem.at_bound(bound), frozen.at_bound(bound)
         whitener = isotropic_whitener(problem)
+        start = approach(start, level, isotropic_whitener(level), config.approach_steps)
     else:
         eye = jnp.broadcast_to(jnp.eye(3, dtype=problem.src.dtype), covariances.shape)
         whitener = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(covariances), eye, lower=True)
-        start = approach(consensus.motion, frozen, whitener, config.approach_steps)
+        start = approach(consensus.motions[0], frozen, whitener, _WHITENED_STEPS)
     factor = jnp.ones((), problem.src.dtype)
     if config.estimate_scale:
         level = frozen.at_bound(problem.bound)
@@ -124,9 +128,8 @@ def solve(
     result = jnp.where(usable < 3, int(Result.TOO_FEW_POINTS), result)
 
     remaining = jnp.where(inlier, 0, problem.weights)
-    second, second_score = find_second(consensus, frozen, remaining, config)
-    votes = score(jax.tree.map(lambda x: x[None], second), dataclasses.replace(frozen, weights=remaining))[0]
-    stands_out = distinction(second_score, consensus.null, vote(frozen)) > config.settle
+    second, votes = find_second(frozen.weighed(remaining), config)
+    stands_out = distinction(votes, consensus.null, vote(frozen)) > config.settle
     second_inliers = jnp.where(stands_out, jnp.round(votes), 0).astype(jnp.int32)
 
     def world(local: SE3, factor) -> SE3:
