@@ -34,7 +34,7 @@ class DetectConfig:
     """Pixels by which masks are dilated before they are used as outlines."""
     guessed: float = 0.3
     """Dissimilarity to be expected where the scene's colours are guesses, under something that left."""
-    moved: float = 0.05
+    moved: float = 0.1
     """Least dissimilarity to be expected of an object away from its first place: other light, sides seldom seen."""
     unexplained: float = 0.4
     """Expected dissimilarity from which on the initial scene says nothing: no photograph showed it well enough."""

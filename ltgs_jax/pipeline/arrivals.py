@@ -34,13 +34,13 @@ _FLAT = 0.15  # height over width under which something on bared ground is the g
 
 
 class Arrival(eqx.Module):
-    """Something that came: its volume and outlines, the surface below, windows around it, and the share of its
-    outlines that shows ground nobody saw before."""
+    """Something that came: its volume and outlines, the surface below, windows around it, and whether it may be ground
+    that nobody saw before: much of it was guessed, or something stood there and left."""
 
     instance: Instance
     support: Support
     crop: Crop
-    bared: float
+    bared: bool
 
 
 def place_arrivals(
@@ -74,7 +74,8 @@ def place_arrivals(
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
         crop = _crop_around(instance, observations, evidence, config)
-        arrivals.append(Arrival(instance, support, crop, float(share)))
+        bare = share > 0.4 or _where_something_left(state, t, instance, gone)
+        arrivals.append(Arrival(instance, support, crop, bool(bare)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
     accounts = []
     pairs = _assigned(len(arrivals), placements, config)
@@ -295,19 +296,30 @@ def _new_object(
     if not config.template.tau_new <= gain <= 1.3:
         progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
         return state, None
-    errors = np.full(template.splats.count, config.detect.moved, state.errors.dtype)
-    if arrival.bared > 0.4 and _is_flat(template, arrival.support):
+    errors = np.full(template.splats.count, 0.5 * config.detect.guessed, state.errors.dtype)
+    if arrival.bared and _is_flat(template, arrival.support):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
         return extend_background(state, template.splats, errors, np.zeros(len(errors), bool)), None
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", gain, error, arrival.instance.views)
 
 
+def _where_something_left(state: State, t: int, instance: Instance, gone) -> bool:
+    """Whether an instance's middle lies within the size of a template from where that stood before it left."""
+    middle = np.median(instance.points, axis=0)
+    for k in gone:
+        means = jnp.asarray(state.chronology.templates[k].splats.means)
+        stood = np.median(np.asarray(state.chronology.world_from_template[t - 1, k].apply(means)), axis=0)
+        if np.linalg.norm(middle - stood) < template_diameter(state.chronology.templates[k].splats):
+            return True
+    return False
+
+
 def _is_flat(template: Template, support: Support) -> bool:
     means, weight = np.asarray(template.splats.means, np.float64), np.asarray(template.splats.opacities)
     firm = means[weight > min(0.3, np.quantile(weight, 0.7))]
     width = np.linalg.norm(np.ptp(firm @ support.frame()[:2].T, axis=0))
-    return bool(np.quantile(support.height(firm), 0.9) < _FLAT * width)
+    return bool(np.median(support.height(firm)) < _FLAT * width)
 
 
 def _settle_new(template: Template, crop: Crop, eye: Eye, config: Config) -> tuple[Template, float, float]:

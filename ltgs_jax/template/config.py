@@ -21,7 +21,7 @@ class TemplateConfig:
     """Voxels along the longest edge of a new object's visual hull."""
     new_splats: int = 2048
     """Most splats a new object starts with."""
-    tau_new: float = 0.4
+    tau_new: float = 0.65
     """Share of the change that a new object must explain after its short fit."""
     new_steps: int = 80
     """Steps of the short fit of a new object, before its template is used."""
