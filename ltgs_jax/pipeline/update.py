@@ -101,15 +101,19 @@ def update(
         write_json(out / "env.json", _environment())
         say_outlook(look_ahead(capture, config, None if scene is None else scene.count), progress)
         store = Store(out, progress)
-        key = digest(
-            config, seed, [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
-        )
+        # The key of a stage holds the options it reads and the key of the stage before: an option of a later stage
+        # leaves the earlier ones as they are.
+        files = [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
+        key = digest(config.io, config.localize, config.render, seed, files)
         run = _locate_photographs(store, key, capture, config, seed, progress)
-        key = digest(key, run.statuses)
+        key = digest(
+            key, run.statuses, config.fit.initial, config.detect.gamma, read_bytes(given) if given is not None else None
+        )
         eye = Eye()
-        splats, errors = _initial_scene(store, key, run, scene, given, front_end, eye, progress)
+        splats, errors = _initial_scene(store, key, run, scene, front_end, eye, progress)
         state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
+        key = digest(key, config.detect, config.match, config.template, config.register)
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
@@ -201,7 +205,7 @@ def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tu
     return views
 
 
-def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, eye: Eye, progress):
+def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye, progress):
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
     config = run.config
 
@@ -233,7 +237,7 @@ def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, ey
         errors = (votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)
         return {**pack_splats("", splats), "errors": errors.astype(np.float32)}, {"counts": {"splats": splats.count}}
 
-    arrays, _ = store.run("initial", digest(key, read_bytes(given) if given else None, config.fit.initial), compute)
+    arrays, _ = store.run("initial", key, compute)
     return unpack_splats("", arrays), arrays["errors"]
 
 
