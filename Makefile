@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 
-.PHONY: demo test slow check format install lock clean
+.PHONY: demo test slow check format docs install lock clean
 
 demo: $(STAMP)
 	$(BIN)/ltgs demo --out $(OUT)
@@ -28,6 +28,10 @@ format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[docs]'
+	$(BIN)/mkdocs build
+
 install: $(STAMP)
 
 $(STAMP): pyproject.toml requirements.lock .ci/make-venv
@@ -39,4 +43,4 @@ lock: $(STAMP)
 	.ci/write-lock $(BIN)/python $(EXTRAS)
 
 clean:
-	rm -rf $(VENV) .jax_cache .pytest_cache .ruff_cache $(OUT)
+	rm -rf $(VENV) .jax_cache .pytest_cache .ruff_cache site $(OUT)

@@ -28,6 +28,7 @@ RANKS = {
     "fit": 4,
     "pipeline": 5,
     "report": 6,
+    "api": 6,  # what `import ltgs_jax` hands on, lazily
     "view": 7,  # says what happened in the report's words
     "cli": 8,  # starts the viewer and writes the report
 }

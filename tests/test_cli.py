@@ -10,12 +10,13 @@ import sys
 import types
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 from rich.console import Console
 
 from ltgs_jax.cli import main
-from ltgs_jax.cli.arguments import Update, UsageError, parse
+from ltgs_jax.cli.arguments import Export, Update, UsageError, parse
 from ltgs_jax.cli.commands import score_table, visit_number
 from ltgs_jax.cli.main import keep_compiled_code
 from ltgs_jax.cli.progress import BarReporter, LineReporter, make_reporter
@@ -51,6 +52,19 @@ _ROWS = [
 ]
 
 
+_RECORD = {
+    "visits": ["before", "after"],
+    "photographs": [
+        {"name": "before/1.jpg", "status": "mapped", "reason": None},
+        {"name": "before/2.jpg", "status": "thinned out", "reason": None},
+        {"name": "after/1.jpg", "status": "rejected", "reason": "only 7 of its keypoints agree"},
+    ],
+    "points": 1234,
+    "error_px": 0.71,
+    "lenses": [{"params": [512.0, 1, 2, 0]}],
+}
+
+
 @pytest.fixture
 def pipeline(monkeypatch):
     """A pipeline whose functions record what they were called with, and fail when told to."""
@@ -76,7 +90,15 @@ def pipeline(monkeypatch):
 
     fake.update, fake.evaluate = update, evaluate
     fake.render_visit = lambda *arguments: fake.calls.append(("render", *arguments))
-    fake.export_visit = lambda *arguments: fake.calls.append(("export", *arguments))
+    fake.export = lambda *arguments, **options: fake.calls.append(("export", *arguments, options))
+    fake.IntakeConfig = types.SimpleNamespace
+
+    def make_capture(folder, out, *, visits, config, progress):
+        fake.calls.append(("capture", folder, out, visits, vars(config)))
+        progress.stage("structure from motion")
+        return _RECORD
+
+    fake.make_capture = make_capture
     report = types.ModuleType("ltgs_jax.report")
     report.write_report = lambda folder: folder / "report.html"
     monkeypatch.setitem(sys.modules, "ltgs_jax.pipeline", fake)
@@ -130,6 +152,10 @@ def test_an_option_of_a_room_goes_before_the_preset_wherever_it_stands(pipeline)
         ("update in --out o --fit.initial.steps 1.5", "--fit.initial.steps"),
         ("updat in", "updat"),
         ("render d --out o", "--visit"),
+        ("export d --out o --format jpeg", "--format"),
+        ("capture in --out o --first 2", "--first"),
+        ("capture in --out o --max-side -5", "--max-side"),
+        ("capture in", "--out"),
         ("view", "PATH"),
         ("demo --scene party", "--scene"),
     ],
@@ -216,17 +242,39 @@ def test_render_and_export(pipeline, chronology, capsys):
     assert main(["render", folder, "--visit", "after", "--all-test", "--out", "o"]) == 0
     assert main(["render", folder, "--visit", "0", "--camera", "before/1.png", "--out", "o"]) == 0
     assert main(["export", folder, "--visit", "1", "--out", "v.ply"]) == 0
+    assert main(["export", folder, "--format", "colmap", "--out", "c", "--capture", "moved"]) == 0
     assert pipeline.calls == [
         ("render", chronology, 1, None, True, Path("o")),
         ("render", chronology, 0, "before/1.png", False, Path("o")),
-        ("export", chronology, 1, "ply", Path("v.ply")),
+        ("export", chronology, "ply", Path("v.ply"), {"visit": 1, "capture": None}),
+        ("export", chronology, "colmap", Path("c"), {"visit": None, "capture": Path("moved")}),
     ]
     capsys.readouterr()
     assert main(["render", folder, "--visit", "0", "--out", "o"]) == 2
     assert "--camera" in _one_line_error(capsys)
 
 
-@pytest.mark.parametrize("words", ["eval {0}", "render {0} --visit 0 --all-test --out o", "view {0}"])
+def test_capture_says_what_became_of_the_photographs(pipeline, capsys):
+    assert main(["capture", "in", "--out", "o", "--visits", "b", "a", "--later", "5"]) == 0
+    assert pipeline.calls == [
+        ("capture", Path("in"), Path("o"), ("b", "a"), {"first": 100, "later": 5, "max_side": 1600})
+    ]
+    out = capsys.readouterr().out
+    row = next(line for line in out.splitlines() if "after" in line)
+    assert re.findall(r"\d+", row) == ["1", "0", "0", "0", "1"]
+    assert "left out: after/1.jpg: only 7 of its keypoints agree" in out
+    assert "1234 points" in out and "ltgs update o --out" in out
+
+
+def test_the_short_names_of_limits_are_those_of_the_rooms(pipeline, tmp_path):
+    words = ["update", "in", "--out", str(tmp_path), "--preset", "tiny", "--max-splats", "99"]
+    assert main(words) == 0
+    assert pipeline.calls[0][3] == _Config(fit=_Fit(_Initial(steps=7, max_splats=99)))
+
+
+@pytest.mark.parametrize(
+    "words", ["eval {0}", "render {0} --visit 0 --all-test --out o", "export {0} --out o", "view {0}"]
+)
 def test_a_folder_without_a_chronology_is_named(pipeline, tmp_path, capsys, words):
     assert main(words.format(tmp_path).split()) == 2
     assert str(tmp_path) in _one_line_error(capsys)
@@ -303,7 +351,7 @@ def test_the_installed_command_answers_without_importing_jax():
 
 
 def test_an_unknown_command_is_a_usage_error():
-    with pytest.raises(UsageError, match="demo, update, eval"):
+    with pytest.raises(UsageError, match="demo, capture, update, eval"):
         parse(["explode"])
 
 
@@ -335,7 +383,10 @@ def test_the_real_pipeline_takes_what_the_commands_give():
     inspect.signature(pipeline.update).bind(Path("in"), Path("out"), **options)
     inspect.signature(pipeline.evaluate).bind(Path("out"), None)
     inspect.signature(pipeline.render_visit).bind(Path("out"), 1, None, True, Path("folder"))
-    inspect.signature(pipeline.export_visit).bind(Path("out"), 1, "ply", Path("file"))
+    inspect.signature(pipeline.export).bind(Path("out"), "ply", Path("file"), visit=1, capture=None)
+    intake = pipeline.IntakeConfig(first=3, later=2, max_side=0)
+    inspect.signature(pipeline.make_capture).bind(Path("in"), Path("out"), visits=(), config=intake, progress=None)
+    assert get_args(get_type_hints(Export)["format"]) == pipeline.FORMATS
 
 
 def test_the_documents_name_commands_and_options_that_exist(pipeline, capsys):

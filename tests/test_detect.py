@@ -60,6 +60,23 @@ def test_a_new_object_is_found_and_noise_is_not():
     assert (found.mask & ~dilate(true, 6)).sum() == 0
 
 
+def test_what_left_is_told_from_what_came():
+    room = _room(9)
+    flat = np.full_like(room, 0.5)
+    rng = np.random.default_rng(10)
+    thing = rng.uniform(size=(30, 40, 3)).astype(np.float32)
+    rendered, captured = flat.copy(), flat.copy()
+    rendered[10:40, 10:50] = thing
+    captured[50:80, 70:110] = thing
+    noise = rng.normal(scale=0.005, size=room.shape).astype(np.float32)
+    expected = np.zeros(room.shape[:2], np.float32)
+    found = change_map(rendered, captured + noise, expected, np.ones(room.shape[:2], bool), Classical())
+    assert found.mask[15:35, 15:45].mean() > 0.95 and found.mask[55:75, 75:105].mean() > 0.95
+    assert found.left[15:35, 15:45].mean() > 0.9
+    assert found.left[55:75, 75:105].mean() < 0.1
+    assert found.left[60:, :40].mean() < -0.5
+
+
 def test_an_expected_error_is_no_change():
     room = _room(7)
     captured = room.copy()

@@ -126,23 +126,24 @@ def test_a_stage_cut_short_is_done_again_with_the_same_result(run, capture, tmp_
     assert (copy / "chronology.safetensors").read_bytes() == (run / "chronology.safetensors").read_bytes()
 
 
-def test_render_and_export_of_a_finished_run(run, capture, tmp_path):
+def test_renders_of_a_finished_run(run, capture, tmp_path):
     pipeline.render_visit(run, 1, None, True, tmp_path / "all")
     assert len(list((tmp_path / "all").rglob("*.png"))) == 2
-    pipeline.export_visit(run, 0, "ply", tmp_path / "first.ply")
-    assert read_ply(tmp_path / "first.ply").count > 0
     with pytest.raises(InputError, match=r"--camera nowhere\.png"):
         pipeline.render_visit(run, 1, "nowhere.png", False, tmp_path)
-    with pytest.raises(InputError, match="--format jpeg"):
-        pipeline.export_visit(run, 0, "jpeg", tmp_path / "x")
 
 
-def test_a_folder_in_use_is_refused(capture, tmp_path):
-    out = tmp_path / "busy"
-    out.mkdir()
-    (out / ".running").write_text("1")
-    with pytest.raises(InputError, match="another run"):
-        pipeline.update(capture, out, config=CONFIG, progress=Quiet())
+def test_an_option_that_no_run_could_go_with_is_named(capture, tmp_path):
+    for change, name in (
+        (replace(CONFIG, io=replace(CONFIG.io, max_side=3)), "--io.max-side 3: expected at least 16"),
+        (replace(CONFIG, detect=replace(CONFIG.detect, gamma=float("nan"))), "--detect.gamma nan"),
+        (replace(CONFIG, fit=replace(CONFIG.fit, initial=replace(CONFIG.fit.initial, sh_degree=4))), "0 to 3"),
+    ):
+        with pytest.raises(InputError, match=name):
+            pipeline.update(capture, tmp_path / "out", config=change, progress=Quiet())
+    with pytest.raises(InputError, match="--seed -1"):
+        pipeline.update(capture, tmp_path / "out", config=CONFIG, seed=-1, progress=Quiet())
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_missing_capture_is_refused(tmp_path):

@@ -13,7 +13,7 @@ from ltgs_jax.io import InputError
 from ltgs_jax.report import write_report
 from ltgs_jax.report.pictures import color_of, crop_box, difference, read_shown
 from ltgs_jax.report.run import read_run
-from ltgs_jax.report.words import counted, duration, happenings, movement, number, summary
+from ltgs_jax.report.words import caution, counted, duration, happenings, movement, number, summary
 
 VISITS = ["before", "<after> & co", "later"]
 
@@ -161,6 +161,18 @@ def test_the_page_says_what_happened(chronology):
     assert "later/9.png: 7 inliers, fewer than <20>" in text
     assert "1 moved, 1 went" in text or "1 came, 1 went, 1 moved" in text
     assert "20.000" in text and "–" in text and "768 MiB" in text and "61.0" in text
+
+
+def test_a_poor_first_scene_is_said_where_it_matters(chronology):
+    rows = json.loads((chronology / "metrics.json").read_text())
+    for visit, region, value in ((1, "full", 17.0), (1, "static", 22.0), (2, "full", 25.0), (2, "static", 14.4)):
+        rows.append({"key": "psnr_initial", "visit": VISITS[visit], "region": region, "value": value, "unit": "dB"})
+    (chronology / "metrics.json").write_text(json.dumps(rows))
+    run = read_run(chronology)
+    assert caution(run, 1) is None, "what changed must not count"
+    assert "(14 dB)" in caution(run, 2)
+    text, _ = _read(write_report(chronology).read_text())
+    assert text.count("Changes may have been missed") == 1 and "psnr of the first visit's scene" in text
 
 
 def test_words(chronology):

@@ -74,8 +74,8 @@ def test_too_few_points_have_no_support():
 
 def test_what_one_photograph_sees_unchanged_did_not_leave():
     seen = np.array([[5.0, 5, 0, 0], [5, 0, 5, 0]])
-    changed = np.array([[5.0, 5, 0, 0], [0, 0, 5, 0]])
-    left, stayed = gone_evidence(seen, changed)
+    evidence = np.array([[5.0, 5, 0, 0], [-5, 0, 5, 0]])
+    left, stayed = gone_evidence(seen, evidence)
     assert left[0] == 0 and stayed[0] > 0
     assert left[1] > 0 and left[2] > 0
     assert left[3] == 0 and stayed[3] == 0
@@ -101,8 +101,8 @@ def test_a_box_is_cut_out_and_a_shadow_is_not():
     on_box = np.arange(len(means)) >= len(table)
     shadow = ~on_box & (np.linalg.norm(means[:, :2] - [0.6, 0.6], axis=1) < 0.2)
     seen = np.full((3, len(means)), 4.0)
-    changed = np.where(on_box | shadow, 4.0, 0.0) * np.ones((3, 1))
-    found = find_removed(splats, seen, changed, _CAMERAS, pixels=100_000, rng=rng)
+    evidence = np.where(on_box | shadow, 4.0, -4.0) * np.ones((3, 1))
+    found = find_removed(splats, seen, evidence, _CAMERAS, pixels=100_000, rng=rng)
     assert len(found) == 1
     members = found[0].members
     assert members[on_box].mean() > 0.95
@@ -110,11 +110,26 @@ def test_a_box_is_cut_out_and_a_shadow_is_not():
     assert found[0].views == 3
 
 
+def test_a_box_that_turned_in_place_goes_as_a_whole():
+    rng = np.random.default_rng(12)
+    table, (box, colors) = _table(rng), _box(rng)
+    means = np.concatenate([table, box])
+    splats = _splats(means, np.concatenate([np.full((len(table), 3), 0.5), colors]), 0.02)
+    on_box = np.arange(len(means)) >= len(table)
+    looks_the_same = on_box & (means[:, 0] > 0.02)
+    seen = np.full((3, len(means)), 4.0)
+    evidence = np.where(on_box & ~looks_the_same, 4.0, -4.0) * np.ones((3, 1))
+    found = find_removed(splats, seen, evidence, _CAMERAS, pixels=100_000, rng=rng)
+    assert len(found) == 1
+    assert found[0].members[on_box].mean() > 0.9
+    assert found[0].share < 0.7
+
+
 def test_nothing_changed_nothing_removed():
     rng = np.random.default_rng(3)
     splats = _splats(_table(rng), np.full((1500, 3), 0.5), 0.02)
     seen = np.full((3, 1500), 4.0)
-    assert find_removed(splats, seen, 0 * seen, _CAMERAS, pixels=100_000, rng=rng) == []
+    assert find_removed(splats, seen, -seen, _CAMERAS, pixels=100_000, rng=rng) == []
 
 
 def test_the_ground_under_a_box_is_filled_with_the_table_colour():
@@ -162,8 +177,10 @@ def test_a_template_is_found_where_it_stands_now():
     crop = _crop(turned, 40)
     config = TemplateConfig(search_splats=512)
     place = np.array([0.1, 0.1, 0.15])
-    search = search_template(template, support, support, place, crop, size=0.42, config=config)
-    placement = settle_template(search, support, crop, size=0.42, refiner=Refiner())
+    search = search_template(
+        template, support, support, place, crop, size=0.42, refiner=Refiner(), rng=rng, config=config
+    )
+    placement = settle_template(search, crop, size=0.42, refiner=Refiner())
     error = placement.world_from_template.inverse() @ truth
     assert placement.gain > 0.8
     assert placement.overlap > 0.8

@@ -34,6 +34,24 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Capture:
+    """Make a capture of a folder of photographs, one sub-folder per visit: upright, with the cameras of all."""
+
+    folder: Positional[Path]
+    """Folder with one sub-folder of photographs per visit (of a video: its frames)."""
+    out: Path
+    """Folder of the capture; it must not hold anything yet."""
+    visits: tuple[str, ...] = ()
+    """The sub-folders in the order of the visits, the densely photographed one first; by name unless given."""
+    first: int = 100
+    """Most photographs of the first visit; of more, as of a video's frames, the sharpest of each stretch are kept."""
+    later: int = 24
+    """Most photographs of each later visit."""
+    max_side: int = 1600
+    """Longest side of the photographs in the capture, in pixels; 0 leaves their size as it is."""
+
+
+@dataclass(frozen=True)
 class Update(Generic[C]):
     """Find what changed in a capture, and give the scene at every visit. Run again, it resumes."""
 
@@ -48,6 +66,10 @@ class Update(Generic[C]):
     """A trained splat scene of the first visit (Inria layout), instead of fitting one."""
     seed: int = 0
     """Of everything that is drawn at random."""
+    max_splats: int | None = None
+    """Most splats of the fitted initial scene: the same as --fit.initial.max-splats."""
+    max_side: int | None = None
+    """Longest side in pixels at which photographs are worked on: the same as --io.max-side."""
 
 
 @dataclass(frozen=True)
@@ -78,16 +100,19 @@ class Render:
 
 @dataclass(frozen=True)
 class Export:
-    """Write the splats of a visit to one file."""
+    """Write a visit as splats, or all visits as a sequence, an animation of the objects, or a COLMAP model."""
 
     folder: Positional[Path]
     """Folder of the chronology."""
-    visit: str
-    """Name of a visit, or its number from 0."""
     out: Path
-    """The file."""
-    format: str = "ply"
-    """Layout of the file."""
+    """The file; a folder for ply-sequence and colmap."""
+    format: Literal["ply", "compressed-ply", "spz", "splat", "ply-sequence", "gltf", "colmap"] = "ply"
+    """ply, compressed-ply (SuperSplat), spz (Niantic), splat: one visit. ply-sequence: every visit, numbered, as
+    SuperSplat plays them; gltf: the objects' poses as an animation (.glb); colmap: the cameras of all photographs."""
+    visit: str | None = None
+    """Name of a visit, or its number from 0; not for the formats that hold all of them."""
+    capture: Path | None = None
+    """The capture, if it has moved since; for colmap."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +129,7 @@ class View:
 
 COMMANDS: dict[str, type] = {
     "demo": Demo,
+    "capture": Capture,
     "update": Update,
     "eval": Eval,
     "render": Render,

@@ -4,6 +4,7 @@ import contextlib
 import shutil
 import signal
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import singledispatch
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from rich.text import Text
 
 from ltgs_jax.io import InputError, read_json
 
-from .arguments import Demo, Eval, Export, Render, Update, View
+from .arguments import Capture, Demo, Eval, Export, Render, Update, View
 from .progress import Reporter, make_reporter
 
 
@@ -31,10 +32,16 @@ def _demo(options: Demo) -> None:
     capture = options.out / "capture"
     with _reporting() as progress:
         _make_demo_capture(capture, options, progress)
-        pipeline.update(
-            capture, options.out, config=pipeline.PRESETS[options.preset], seed=options.seed, progress=progress
-        )
+        config = _for_small_photographs(pipeline.PRESETS[options.preset])
+        pipeline.update(capture, options.out, config=config, seed=options.seed, progress=progress)
     _finish(options.out, read_json(options.out / "metrics.json", list))
+
+
+def _for_small_photographs(config: Any) -> Any:
+    """Fewer steps and splats: the built-in captures are 240 × 180 pixels, the presets are made for 640."""
+    initial, long = config.fit.initial, config.fit.long
+    initial = replace(initial, steps=min(initial.steps, 500), max_splats=min(initial.max_splats, 15_000))
+    return replace(config, fit=replace(config.fit, initial=initial, long=replace(long, steps=min(long.steps, 150))))
 
 
 def _make_demo_capture(folder: Path, options: Demo, progress: Reporter) -> None:
@@ -57,6 +64,40 @@ def _make_demo_capture(folder: Path, options: Demo, progress: Reporter) -> None:
 
 
 @run.register
+def _capture(options: Capture) -> None:
+    from ltgs_jax import pipeline
+
+    for name, least in (("first", 3), ("later", 1), ("max_side", 0)):
+        if getattr(options, name) < least:
+            raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: expected at least {least}")
+    config = pipeline.IntakeConfig(first=options.first, later=options.later, max_side=options.max_side)
+    with _reporting() as progress:
+        record = pipeline.make_capture(
+            options.folder, options.out, visits=options.visits, config=config, progress=progress
+        )
+    _console().print(capture_table(record))
+    for entry in record["photographs"]:
+        if entry["status"] == "rejected":
+            print(f"left out: {entry['name']}: {entry['reason'] or 'not part of the scene that was found'}")
+    lens = record["lenses"][0]
+    print(f"{record['points']} points, mean error {record['error_px']:.2f} px, focal length {lens['params'][0]:.0f} px")
+    print(f"capture: {options.out}\nnext: ltgs update {options.out} --out {options.out}_chronology")
+
+
+def capture_table(record: dict) -> Table:
+    """What became of the photographs, one line per visit."""
+    table = Table()
+    table.add_column("visit")
+    columns = ("found", "thinned out", "mapped", "localized", "rejected")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for visit in record["visits"]:
+        mine = [p["status"] for p in record["photographs"] if p["name"].split("/")[0] == visit]
+        table.add_row(Text(visit), str(len(mine)), *(str(mine.count(status)) for status in columns[1:]))
+    return table
+
+
+@run.register
 def _update(options: Update) -> None:
     from ltgs_jax import pipeline
 
@@ -64,12 +105,23 @@ def _update(options: Update) -> None:
         pipeline.update(
             options.capture,
             options.out,
-            config=options.config,
+            config=_with_limits(options),
             initial=options.initial,
             seed=options.seed,
             progress=progress,
         )
     _finish(options.out, read_json(options.out / "metrics.json", list))
+
+
+def _with_limits(options: Update) -> Any:
+    """The options of the rooms, with the two that have a short name."""
+    config = options.config
+    if options.max_splats is not None:
+        initial = replace(config.fit.initial, max_splats=options.max_splats)
+        config = replace(config, fit=replace(config.fit, initial=initial))
+    if options.max_side is not None:
+        config = replace(config, io=replace(config.io, max_side=options.max_side))
+    return config
 
 
 @run.register
@@ -95,8 +147,9 @@ def _render(options: Render) -> None:
 def _export(options: Export) -> None:
     from ltgs_jax import pipeline
 
-    visit = visit_number(_chronology(options.folder), options.visit)
-    pipeline.export_visit(options.folder, visit, options.format, options.out)
+    folder = _chronology(options.folder)
+    visit = None if options.visit is None else visit_number(folder, options.visit)
+    pipeline.export(folder, options.format, options.out, visit=visit, capture=options.capture)
     print(options.out)
 
 
@@ -142,11 +195,13 @@ def _finish(folder: Path, rows: Sequence[dict]) -> None:
     from ltgs_jax.report import write_report
 
     report = write_report(folder)
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=120)  # a log file is no narrower than that
-    console.print(score_table(rows))
+    _console().print(score_table(rows))
     print(f"report: {report}")
+
+
+def _console() -> Console:
+    console = Console()
+    return console if console.is_terminal else Console(width=120)  # a log file is no narrower than that
 
 
 def _chronology(folder: Path) -> Path:
@@ -157,7 +212,10 @@ def _chronology(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _reporting() -> Iterator[Reporter]:
-    """A reporter that is closed at the end; a polite kill then ends like Ctrl-C."""
+    """A reporter that is closed at the end; a polite kill then ends like Ctrl-C.
+
+    To be entered after the pipeline is imported: the import of pycolmap takes the signal for itself.
+    """
 
     def interrupt(*_) -> None:
         raise KeyboardInterrupt

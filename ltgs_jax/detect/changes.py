@@ -13,6 +13,10 @@ from ltgs_jax.features import FrontEnd
 
 from .similarity import similarity
 
+_LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise and resampling
+_LEAST_GRADIENT = 0.01  # per pixel, in 0…1: what noise makes of a flat surface
+_COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
+
 
 @dataclass(frozen=True)
 class DetectConfig:
@@ -22,23 +26,31 @@ class DetectConfig:
     """γ, the share of semantic cosine against SSIM."""
     sigmas: float = 5.0
     """A difference counts from this many robust standard deviations of the unchanged pixels on."""
+    alone: float = 10.0
+    """Mean score, in the same deviations, of something that only one photograph shows."""
     min_area: float = 4e-4
     """Smallest region, as a share of the image."""
     dilate: int = 3
     """Pixels by which masks are dilated before they are used as outlines."""
     guessed: float = 0.3
     """Dissimilarity to be expected where the scene's colours are guesses, under something that left."""
+    moved: float = 0.1
+    """Least dissimilarity to be expected of an object away from its first place: other light, sides seldom seen."""
     unexplained: float = 0.4
     """Expected dissimilarity from which on the initial scene says nothing: no photograph showed it well enough."""
 
 
 class ChangeMap(eqx.Module):
-    """`score` in robust standard deviations above expectation; `mask` the pixels past the threshold; the threshold;
-    `two_classes` whether Otsu's split is one (False: the mask is empty, nothing changed)."""
+    """What one photograph says of change.
+
+    `score` in robust standard deviations above expectation; `left` where the render shows what the photograph does not,
+    −1…1: −1 where the pixel is as expected, 1 where something left, 0 where it cannot be told; `mask` the pixels that
+    changed, whichever way; `two_classes` whether there is a class of changed pixels at all (False: the mask is empty).
+    """
 
     score: Float[np.ndarray, "h w"]
+    left: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
-    threshold: float
     two_classes: bool
 
 
@@ -51,28 +63,95 @@ def change_map(
     *,
     config: DetectConfig = DetectConfig(),
 ) -> ChangeMap:
-    """Coarse change mask of one photograph.
+    """Change mask of one photograph.
 
-    1 − similarity, less what the scene's own fit lets `expected`, in units of the unchanged pixels' robust deviation;
-    binarised by Otsu, but never below `config.sigmas`, and only where the part above is a class of its own.
+    1 − similarity, less what the scene's own fit lets `expected`, in units of the deviation that unchanged pixels of
+    the same expectation show; binarised by Otsu, but never below `config.sigmas`, and only where the part above is a
+    class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, and
+    that alone is proof; what came has it in the photograph, as has all that the scene never knew well.
+    Descriptors reach several pixels beyond what changed: the outline is that of the colours.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
     captured = np.where(valid[..., None], captured, rendered)
-    difference = 1 - similarity(rendered, captured, front_end, gamma=config.gamma)
-    excess = difference - expected
     known = valid & (expected < config.unexplained)
-    inside = excess[known]
-    if len(inside) < 64:
-        return ChangeMap(np.zeros_like(excess), np.zeros_like(valid), np.inf, False)
-    middle = np.median(inside)
-    deviation = 1.4826 * np.median(np.abs(inside - middle)) + 0.01
-    score = np.where(known, (excess - middle) / deviation, 0).astype(np.float32)
-    clipped = np.clip(score[known], 0, 4 * config.sigmas)
-    threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
-    mask = known & (score > threshold)
-    mask = clean(mask, config.min_area)
-    two_classes = bool(mask.any())
-    return ChangeMap(score, mask, threshold, two_classes)
+    if known.sum() < 64:
+        nothing = np.zeros_like(expected, dtype=np.float32)
+        return ChangeMap(nothing, nothing, np.zeros_like(valid), False)
+    excess = 1 - similarity(rendered, captured, front_end, gamma=config.gamma) - expected
+    balance = _detail_balance(rendered, captured)
+    scores, masks, thresholds = [], [], []
+    colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas
+    for weight in (np.clip(0.5 + balance, 0, 1.25), np.clip(1 - balance, 0, 1)):
+        score = _standardize(excess * weight, expected, known, floor=0.01)
+        clipped = np.clip(score[known], 0, 4 * config.sigmas)
+        threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
+        coarse = clean(known & (score > threshold), config.min_area)
+        scores.append(score / threshold)
+        masks.append((coarse, _sharpen(coarse, known & colours, config)))
+        thresholds.append(threshold)
+    (coarse_left, left), (coarse_came, came) = masks
+    plain = np.maximum(*scores)
+    mask = left | came
+    # Where both have detail, one thing took another's place.
+    replaced = left | (came & (balance > -0.3))
+    evidence = np.where(known & ~coarse_left & ~coarse_came, np.clip(2 * plain, 0, 1) - 1, replaced.astype(np.float32))
+    return ChangeMap(plain * max(thresholds), evidence.astype(np.float32), mask, bool(mask.any()))
+
+
+def _detail_balance(
+    rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w"]:
+    """Whose gradients are stronger around each pixel: 1 the render's alone, −1 the photograph's alone."""
+
+    def energy(image):
+        grey = cv2.GaussianBlur(image.mean(axis=-1).astype(np.float32), (0, 0), 1.0)
+        gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)
+        return cv2.GaussianBlur(gx * gx + gy * gy, (0, 0), max(image.shape[:2]) / 100)
+
+    a, b = energy(rendered), energy(captured)
+    return (a - b) / (a + b + _LEAST_GRADIENT**2)
+
+
+def _standardize(
+    value: Float[np.ndarray, "h w"], expected: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], *, floor: float
+) -> Float[np.ndarray, "h w"]:
+    """`value` in robust deviations above its usual level, 0 where not `known`.
+
+    Level and deviation grow in proportion to `expected`: what the scene explains badly differs more, and differs more
+    widely. The two factors are medians over bins of equal expectation, so that neither a large change nor a large
+    blurred background decides them alone.
+    """
+    scale = expected + _LEAST_EXPECTED
+    ratio = (value / scale)[known]
+    order = np.argsort(expected[known], kind="stable")
+    bins = np.array_split(order, int(np.clip(len(order) // 400, 1, 12)))
+    level = np.median([np.median(ratio[b]) for b in bins])
+    spread = np.median([1.4826 * np.median(np.abs(ratio[b] - level)) for b in bins])
+    return np.where(known, (value - level * scale) / (spread * scale + floor), 0).astype(np.float32)
+
+
+def _colour_difference(
+    rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
+) -> Float[np.ndarray, "h w"]:
+    """Mean absolute difference of the colours, the smallest over shifts of the render by up to a pixel."""
+    captured = cv2.GaussianBlur(captured, (0, 0), 0.7)
+    padded = cv2.copyMakeBorder(cv2.GaussianBlur(rendered, (0, 0), 0.7), 1, 1, 1, 1, cv2.BORDER_REPLICATE)
+    h, w = captured.shape[:2]
+    shifted = [np.abs(padded[y : y + h, x : x + w] - captured).mean(axis=-1) for y in range(3) for x in range(3)]
+    return np.min(shifted, axis=0)
+
+
+def _sharpen(
+    coarse: Bool[np.ndarray, "h w"], fine: Bool[np.ndarray, "h w"], config: DetectConfig
+) -> Bool[np.ndarray, "h w"]:
+    """Each coarse region cut to where colours differ too, closed and filled; whole where they hardly do (texture)."""
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7))
+    closed = cv2.morphologyEx((fine & coarse).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
+    closed = clean(ndimage.binary_fill_holes(closed) & coarse, config.min_area)
+    labels, count = ndimage.label(coarse, np.ones((3, 3)))
+    area = np.bincount(labels.ravel(), minlength=count + 1)
+    share = np.bincount(labels.ravel(), closed.ravel(), minlength=count + 1) / np.maximum(area, 1)
+    return np.where((share > _COLOURLESS)[labels], closed, coarse)
 
 
 def clean(mask: Bool[np.ndarray, "h w"], min_area: float) -> Bool[np.ndarray, "h w"]:

@@ -11,4 +11,6 @@ from .initial import splats_from_points as splats_from_points
 from .local import Windows as Windows
 from .local import fit_local as fit_local
 from .loss import photometric_loss as photometric_loss
+from .views import Budget as Budget
+from .views import StreamedView as StreamedView
 from .views import View as View

@@ -15,7 +15,7 @@ from ltgs_jax.scene import Chronology, Splats, compose
 
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
-from .views import View, plan_for, scene_extent, size_of
+from .views import StreamedView, View, plan_for, scene_extent, size_of
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class LongConfig:
 class VisitView(eqx.Module):
     """A photograph and the visit whose scene it shows."""
 
-    view: View
+    view: View | StreamedView
     visit: int
 
 

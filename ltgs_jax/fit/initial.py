@@ -17,7 +17,7 @@ from ltgs_jax.scene import Splats
 from .growth import faint, recycle
 from .loss import photometric_loss
 from .optimizer import Rates, adam, reset_moments, scale_gradients
-from .views import View, half_size, plan_for, scene_extent, size_of
+from .views import StreamedView, View, halved, plan_for, scene_extent, size_of
 
 
 @dataclass(frozen=True)
@@ -102,12 +102,12 @@ def _error_votes(splats: Splats, camera: Camera, image, mask, plan: RenderPlan) 
     return splat_votes(splats, camera, (residual * mask)[..., None], plan=plan)
 
 
-def _error_scores(splats: Splats, views: Sequence[View], plans: dict) -> Float[Array, " n"]:
+def _error_scores(splats: Splats, views: Sequence[View | StreamedView], plans: dict) -> Float[Array, " n"]:
     """Error mass of each splat over some views."""
     return sum(_error_votes(splats, v.camera, v.image, v.mask, plans[size_of(v)]) for v in views)[:, 0]
 
 
-def _plans(splats: Splats, views: Sequence[View]) -> dict[tuple[int, int], RenderPlan]:
+def _plans(splats: Splats, views: Sequence[View | StreamedView]) -> dict[tuple[int, int], RenderPlan]:
     """One plan per image size."""
     sizes = sorted({size_of(view) for view in views})
     # Roomy, since every new plan is a new compilation: splats shrink while they are fitted, but their number grows.
@@ -116,7 +116,7 @@ def _plans(splats: Splats, views: Sequence[View]) -> dict[tuple[int, int], Rende
 
 def fit_initial(
     splats: Splats,
-    views: Sequence[View],
+    views: Sequence[View | StreamedView],
     *,
     key: Array,
     config: InitialConfig = InitialConfig(),
@@ -124,7 +124,8 @@ def fit_initial(
 ) -> FitResult:
     """Fit `splats` (faint ones are free slots) to photographs: L1 + D-SSIM, Adam, growth at fixed capacity.
 
-    `views` may differ in size. `progress(step, steps, text)` is called now and then. Raises ValueError without a view.
+    `views` may differ in size, and be streamed. `progress(step, steps, text)` is called now and then.
+    Raises ValueError without a view.
     """
     if not views:
         raise ValueError("views: expected at least one photograph to fit, got none")
@@ -138,7 +139,7 @@ def fit_initial(
     splats = jax.tree.map(jnp.copy, splats)  # the steps donate their buffers, and the caller's are not ours
     state = adam().init(splats)
     losses = np.zeros(config.steps, np.float32)
-    current, plans, order = [half_size(view) for view in views], {}, []
+    current, plans, order = halved(views), {}, []
     if coarse_steps == 0:
         current = list(views)
     for step in range(config.steps):

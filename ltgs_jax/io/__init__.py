@@ -21,9 +21,15 @@ from .gltf import write_gltf as write_gltf
 from .images import as_rgb as as_rgb
 from .images import read_labels as read_labels
 from .images import read_pixels as read_pixels
+from .images import resize_image as resize_image
 from .images import scaled_size as scaled_size
 from .images import write_image as write_image
 from .images import write_labels as write_labels
+from .intake import Intake as Intake
+from .intake import Upright as Upright
+from .intake import bring_in as bring_in
+from .intake import find_intake as find_intake
+from .intake import sharpest as sharpest
 from .lens import CameraModel as CameraModel
 from .photographs import Photograph as Photograph
 from .photographs import distort_labels as distort_labels
@@ -31,6 +37,7 @@ from .photographs import load_image as load_image
 from .photographs import load_mask as load_mask
 from .ply import read_ply as read_ply
 from .ply import write_ply as write_ply
+from .splat_files import SPLAT_FORMATS as SPLAT_FORMATS
 from .splat_files import WRITERS as WRITERS
 from .splat_files import read_splats as read_splats
 from .splat_files import write_splats as write_splats

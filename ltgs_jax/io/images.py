@@ -14,6 +14,8 @@ from .lens import CameraModel, distort_map, is_pinhole, undistort_map
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 _MOST_PIXELS = 1 << 28  # 268 megapixels: beyond any camera; a header that claims more is not believed
 _MOST_PIXELS_PER_BYTE = 4000  # an empty mask as PNG reaches 1000; beyond this the header is not believed
+_LARGE_PIXELS = 1 << 25  # beyond 33 megapixels, where it costs memory, a picture must be one
+_MOST_PIXELS_PER_BYTE_LARGE = 50  # a plain wall as JPEG reaches 30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,7 +50,8 @@ def read_header(path: Path) -> ImageHeader:
     image.close()
     width, height = spec.width, spec.height
     size = path.stat().st_size
-    if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, _MOST_PIXELS_PER_BYTE * size)):
+    per_byte = _MOST_PIXELS_PER_BYTE if width * height <= _LARGE_PIXELS else _MOST_PIXELS_PER_BYTE_LARGE
+    if not (width > 0 and height > 0 and width * height <= min(_MOST_PIXELS, per_byte * size)):
         raise InputError(f"{path}: its header claims {width}×{height} pixels in {size} bytes")
     # Equivalent focal lengths refer to film 36 mm wide.
     equivalent = spec.get_float_attribute("Exif:FocalLengthIn35mmFilm", 0.0)
@@ -189,7 +192,7 @@ def resize_mask(mask: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np
 def write_image(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w"]) -> None:
     """Write an image in 0..1 with 8 bits, by the suffix, in one step. Raises InputError."""
     pixels = np.rint(np.clip(np.nan_to_num(np.asarray(image)), 0, 1) * 255).astype(np.uint8)
-    _write_pixels(Path(path), pixels)
+    write_pixels(Path(path), pixels)
 
 
 def _label_dtype(labels: np.ndarray) -> type:
@@ -201,7 +204,7 @@ def write_labels(path: str | Path, labels: Integer[np.ndarray, "h w"]) -> None:
     labels = np.asarray(labels)
     if labels.size and not 0 <= labels.min() <= labels.max() < 1 << 16:
         raise ValueError(f"labels: expected ids from 0 to 65535, got {labels.min()} to {labels.max()}")
-    _write_pixels(Path(path), labels.astype(_label_dtype(labels)))
+    write_pixels(Path(path), labels.astype(_label_dtype(labels)))
 
 
 def read_labels(path: str | Path) -> Integer[np.ndarray, "h w"]:
@@ -209,7 +212,8 @@ def read_labels(path: str | Path) -> Integer[np.ndarray, "h w"]:
     return read_pixels(Path(path))[..., 0]
 
 
-def _write_pixels(path: Path, pixels: np.ndarray) -> None:
+def write_pixels(path: Path, pixels: np.ndarray) -> None:
+    """Write pixels [h w] or [h w c] in their own type, by the suffix, in one step. Raises InputError."""
     if pixels.ndim == 2:
         pixels = pixels[..., None]
     with replacing(path) as beside:

@@ -99,3 +99,4 @@ WRITERS: dict[str, tuple[str, Callable[[str | Path, Splats], None]]] = {
     "splat": (".splat", write_splat),
 }
 """Formats that are written: name, suffix, writer."""
+SPLAT_FORMATS = tuple(WRITERS)

@@ -23,6 +23,7 @@ _HIGHER = {0: 0, 1: 9, 2: 24, 3: 45}
 # SPZ has x right, y up, z backward; PLY files have x right, y down, z forward: half a turn about x.
 _HALF_TURN = np.diag([1.0, -1.0, -1.0])
 _MOST_SPLATS = 50_000_000
+_LARGE_BYTES = 1 << 24
 
 
 def read_spz(path: str | Path) -> Splats:
@@ -68,6 +69,7 @@ def _columns(content: bytes, path: str | Path) -> tuple[int, int, int, int, list
         if version != 4:
             raise InputError(f"{path}: is SPZ of version {version}, which is not read outside gzip")
         sizes = _sizes(version, n, degree)
+        _check_shrinkage(sum(sizes), n, content, path)
         return version, n, degree, bits, _zstd_columns(content, sizes, streams, path)
     if content[:2] != b"\x1f\x8b":
         raise InputError(f"{path}: is not an SPZ file")
@@ -77,12 +79,21 @@ def _columns(content: bytes, path: str | Path) -> tuple[int, int, int, int, list
         raise InputError(f"{path}: is SPZ of version {version}; versions 2, 3 and 4 are read")
     sizes = _sizes(version, n, degree)
     total = _HEADER.size + sum(sizes)
-    # A gzip stream shrinks at most about a thousandfold; beyond that the count is not believed.
-    if total > 1100 * len(content) + 1024:
-        raise InputError(f"{path}: is cut short: its header says {n} splats, its {len(content)} bytes cannot hold them")
+    _check_shrinkage(total, n, content, path)
     whole = _inflate(content, total, path)
     edges = np.cumsum([_HEADER.size, *sizes])
     return version, n, degree, bits, [whole[a:b] for a, b in itertools.pairwise(edges)]
+
+
+def _check_shrinkage(total: int, n: int, content: bytes, path: str | Path) -> None:
+    """No scene of that many splats was packed that small: the count is not believed, before memory is asked for it.
+
+    Gzip shrinks at most about a thousandfold; splats that differ from one another by far less, which counts where there
+    are so many that it matters.
+    """
+    most = 1100 if total < _LARGE_BYTES else 50
+    if total > most * len(content) + 1024:
+        raise InputError(f"{path}: is cut short: its header says {n} splats, its {len(content)} bytes cannot hold them")
 
 
 def _parse_header(head: bytes, path: str | Path) -> tuple[int, int, int, int, int]:

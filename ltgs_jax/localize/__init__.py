@@ -5,6 +5,10 @@ from .align import RenderView as RenderView
 from .align import align_photograph as align_photograph
 from .align import splat_view as splat_view
 from .place import localize as localize
+from .structure import Structure as Structure
+from .structure import StructureConfig as StructureConfig
+from .structure import choose_pairs as choose_pairs
+from .structure import reconstruct as reconstruct
 from .types import Localization as Localization
 from .types import LocalizeConfig as LocalizeConfig
 from .types import PhotographStatus as PhotographStatus

@@ -1,10 +1,13 @@
 """Which photographs look alike: global descriptors, so that the work grows with the update and not with the map."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 from jaxtyping import Float, Int
 
 from ltgs_jax.features import dense_descriptors
+from ltgs_jax.io import as_rgb, read_pixels, resize_image, scaled_size
 
 _THUMBNAIL = (128, 96)  # pixels, width first
 _CELLS = 4
@@ -22,6 +25,12 @@ def global_descriptor(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, " 
     # Cells that look like the rest of the picture say little about where it was taken.
     pooled = np.concatenate([pooled - pooled.mean(axis=0), 0.5 * pooled.mean(axis=0, keepdims=True)]).ravel()
     return pooled / np.maximum(np.linalg.norm(pooled), 1e-12)
+
+
+def photograph_descriptor(path: Path) -> Float[np.ndarray, " d"]:
+    """The global descriptor of a photograph on disk, as it is stored."""
+    image = as_rgb(read_pixels(path))
+    return global_descriptor(resize_image(image, scaled_size(image.shape[1], image.shape[0], 160)))
 
 
 def most_alike(

@@ -1,9 +1,12 @@
 """Every option of a run, one frozen dataclass per room, and the presets."""
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from typing import Any
 
 from ltgs_jax.detect import DetectConfig
 from ltgs_jax.fit import InitialConfig, LongConfig
+from ltgs_jax.io import InputError
 from ltgs_jax.localize import LocalizeConfig
 from ltgs_jax.match import MatchConfig
 from ltgs_jax.register import RegisterConfig
@@ -17,6 +20,8 @@ class IoConfig:
 
     max_side: int = 640
     """Longest side in pixels at which photographs are fitted and compared; larger ones are scaled down."""
+    photograph_bytes: int = 1 << 30
+    """Bytes of decoded photographs that are kept; beyond, one is decoded again whenever it is needed."""
 
 
 @dataclass(frozen=True)
@@ -58,3 +63,28 @@ PRESETS: dict[str, Config] = {
         fit=FitConfig(initial=InitialConfig(steps=250, max_splats=6000, sh_degree=0), long=LongConfig(steps=80)),
     ),
 }
+
+
+_LEAST = {"io.max_side": 16, "fit.initial.max_splats": 4, "fit.initial.steps": 1, "fit.initial.grow_every": 1}
+_MOST = {"fit.initial.sh_degree": 3}
+
+
+def check_config(config: Config, seed: int = 0) -> None:
+    """Raises InputError that names the option, as the command line calls it, when no run could go with it."""
+    _check("seed", seed)
+    _check("", config)
+
+
+def _check(name: str, value: Any) -> None:
+    """Numbers are finite and not negative, and within what the code can do."""
+    if is_dataclass(value):
+        for item in fields(value):
+            _check(f"{name}.{item.name}".lstrip("."), getattr(value, item.name))
+    elif isinstance(value, tuple):
+        for item in value:
+            _check(name, item)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        least, most = _LEAST.get(name, 0), _MOST.get(name, math.inf)
+        if not (math.isfinite(value) and least <= value <= most):
+            bound = f"at least {least}" if most == math.inf else f"{least} to {most}"
+            raise InputError(f"--{name.replace('_', '-')} {value}: expected {bound}")

@@ -1,16 +1,22 @@
 """The present scene as a visit's photographs should show it, rendered with few compilations."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ltgs_jax.detect import ChangeMap, change_map
+from ltgs_jax.features import FrontEnd
 from ltgs_jax.geometry import Camera
 from ltgs_jax.match import Cone
 from ltgs_jax.render import RenderPlan, plan_render, render, splat_votes
 from ltgs_jax.scene import Splats
 from ltgs_jax.template import Refiner
+
+from .config import Config
 
 _BUCKET = 8192  # splat counts are padded to multiples of this, so that a cut or an addition compiles nothing anew
 
@@ -113,6 +119,31 @@ class Eye:
         padded = pad_splats(splats)
         votes = _votes(padded, camera, jnp.asarray(values, jnp.float32), self._plan(padded, camera))
         return np.asarray(votes)[: splats.count]
+
+
+class Evidence(eqx.Module):
+    """Looks at the scene, and what every photograph says of change."""
+
+    looks: tuple[Look, ...]
+    changes: tuple[ChangeMap, ...]
+
+    @property
+    def masks(self) -> list[Bool[np.ndarray, "h w"]]:
+        """The pixels of each photograph that changed."""
+        return [change.mask for change in self.changes]
+
+
+def compare(
+    eye: Eye, scene: tuple, observations: Sequence[Observation], front_end: FrontEnd, config: Config
+) -> Evidence:
+    """Every photograph against the scene (`scene_at`) as its camera sees it."""
+    splats, errors, *_ = scene
+    looks = [eye.look(splats, o.camera, errors) for o in observations]
+    changes = [
+        change_map(look.image, o.image, look.expected, o.valid, front_end, config=config.detect)
+        for look, o in zip(looks, observations, strict=True)
+    ]
+    return Evidence(tuple(looks), tuple(changes))
 
 
 def projection_of(camera: Camera) -> Float[np.ndarray, "3 4"]:

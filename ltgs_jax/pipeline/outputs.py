@@ -22,7 +22,7 @@ from ltgs_jax.io import (
 from ltgs_jax.scene import Chronology, Splats, compose, drop_hidden
 
 from .looks import Eye
-from .visit import Account
+from .state import Account
 
 _STILL = 1e-3  # a pose that changed by less, in object sizes or radians, did not change
 
@@ -60,6 +60,8 @@ def write_outputs(
             },
         )
         shown = [p for p in cameras.values() if (p.visit > 0 and p.role in ("update", "test")) or p.role == "test"]
+        if not any(p.visit == 0 for p in shown):  # one, by which the first scene can be judged
+            shown += [p for p in cameras.values() if p.visit == 0][:1]
         manifest = []
         for i, photograph in enumerate(shown):
             progress.step(i, len(shown), f"rendering {photograph.name}")

@@ -1,8 +1,8 @@
-"""Images and splat files of a finished run."""
+"""Images of a finished run."""
 
 from pathlib import Path
 
-from ltgs_jax.io import InputError, load_chronology, write_image, write_ply
+from ltgs_jax.io import InputError, load_chronology, write_image
 from ltgs_jax.scene import compose, drop_hidden
 
 from .looks import Eye
@@ -28,10 +28,3 @@ def render_visit(out_dir: str | Path, visit: int, camera_name: str | None, all_t
     eye = Eye()
     for name in names:
         write_image(folder / Path(name).with_suffix(".png"), eye.image(scene, cameras[name][2]))
-
-
-def export_visit(out_dir: str | Path, visit: int, format: str, file: str | Path) -> None:
-    """Write the splats of one visit. Raises InputError for a format that is not known."""
-    if format != "ply":
-        raise InputError(f"--format {format}: expected ply")
-    write_ply(file, drop_hidden(compose(load_chronology(out_dir), visit)))

@@ -3,8 +3,8 @@
 import dataclasses
 import os
 import platform
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -16,7 +16,7 @@ import numpy as np
 
 from ltgs_jax.detect import fit_tone, similarity
 from ltgs_jax.features import Classical, FrontEnd
-from ltgs_jax.fit import View, VisitView, fit_chronology, fit_initial, splats_from_points
+from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import (
     CameraModel,
@@ -32,15 +32,17 @@ from ltgs_jax.io import (
     write_json,
 )
 from ltgs_jax.localize import Localization, localize
-from ltgs_jax.scene import Chronology, Splats, Template
-from ltgs_jax.template import Support
+from ltgs_jax.scene import Chronology
 
-from .config import Config
+from .config import Config, check_config
 from .evaluate import evaluate
+from .hold import only_run
 from .looks import Eye, Observation
+from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
+from .state import Account, State, pack_splats, pack_state, unpack_splats, unpack_state
 from .store import Store, digest
-from .visit import Account, State, explain_visit
+from .visit import explain_visit
 
 
 class Progress(Protocol):
@@ -70,27 +72,6 @@ class Run:
         return [p for p in self.capture.at(visit, role) if p.name in self.cameras]
 
 
-@contextmanager
-def _only_run(folder: Path) -> Iterator[None]:
-    """Holds the folder for this process; a second run into it is refused, a dead one's hold is taken over."""
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = folder / ".running"
-    try:
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    except FileExistsError:
-        holder = lock.read_text().strip()
-        if holder.isdecimal() and Path(f"/proc/{holder}").exists() and int(holder) != os.getpid():
-            raise InputError(f"{folder}: another run (process {holder}) is writing there") from None
-        lock.unlink(missing_ok=True)
-        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
-    os.write(handle, str(os.getpid()).encode())
-    os.close(handle)
-    try:
-        yield
-    finally:
-        lock.unlink(missing_ok=True)
-
-
 def update(
     capture_dir: str | Path,
     out_dir: str | Path,
@@ -105,32 +86,34 @@ def update(
 
     Raises InputError, one line, for what is wrong with the capture or an option.
     """
+    check_config(config, seed)
     out = Path(out_dir)
     capture = read_capture(capture_dir)
     given = Path(initial) if initial is not None else capture.initial_ply
     scene = read_ply(given) if given is not None else None
     front_end = front_end or Classical()
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from None
-    with _only_run(out):
+    with only_run(out):
         for name, reason in capture.problems:
             progress.warn(f"{name}: {reason}")
         write_json(
             out / "config.json", {**dataclasses.asdict(config), "seed": seed, "initial": str(given) if given else None}
         )
         write_json(out / "env.json", _environment())
+        say_outlook(look_ahead(capture, config, None if scene is None else scene.count), progress)
         store = Store(out, progress)
-        key = digest(
-            config, seed, [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
-        )
+        # The key of a stage holds the options it reads and the key of the stage before: an option of a later stage
+        # leaves the earlier ones as they are.
+        files = [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
+        key = digest(config.io, config.localize, config.render, seed, files)
         run = _locate_photographs(store, key, capture, config, seed, progress)
-        key = digest(key, run.statuses)
+        key = digest(
+            key, run.statuses, config.fit.initial, config.detect.gamma, read_bytes(given) if given is not None else None
+        )
         eye = Eye()
-        splats, errors = _initial_scene(store, key, run, scene, given, front_end, eye, progress)
-        state = State(Chronology.of_initial(splats, capture.visits), errors, (), ())
+        splats, errors = _initial_scene(store, key, run, scene, front_end, eye, progress)
+        state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
+        key = digest(key, config.detect, config.match, config.template, config.register)
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
@@ -201,12 +184,18 @@ def load_view(run: Run, photograph: Photograph) -> View:
     )
 
 
-def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, View]]:
-    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error."""
-    views = []
+def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, StreamedView]]:
+    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error.
+
+    Each is decoded once here; the pixels of as many as `io.photograph_bytes` holds stay in memory.
+    """
+    views, budget = [], Budget(run.config.io.photograph_bytes)
     for photograph in photographs:
+        camera = scaled_camera(run.cameras[photograph.name], run.config.io.max_side)
+        view = StreamedView(camera, partial(load_view, run, photograph), budget)
         try:
-            views.append((photograph, load_view(run, photograph)))
+            view.check()
+            views.append((photograph, view))
         except InputError as error:
             progress.warn(f"{photograph.name}: left out, {error}")
     if photographs and not views:
@@ -216,7 +205,7 @@ def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tu
     return views
 
 
-def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, eye: Eye, progress):
+def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye, progress):
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
     config = run.config
 
@@ -248,21 +237,8 @@ def _initial_scene(store: Store, key: str, run: Run, scene, given, front_end, ey
         errors = (votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)
         return {**pack_splats("", splats), "errors": errors.astype(np.float32)}, {"counts": {"splats": splats.count}}
 
-    arrays, _ = store.run("initial", digest(key, read_bytes(given) if given else None, config.fit.initial), compute)
+    arrays, _ = store.run("initial", key, compute)
     return unpack_splats("", arrays), arrays["errors"]
-
-
-_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-
-
-def pack_splats(prefix: str, splats: Splats) -> dict[str, np.ndarray]:
-    """Arrays by name."""
-    return {f"{prefix}{field}": np.asarray(getattr(splats, field)) for field in _FIELDS}
-
-
-def unpack_splats(prefix: str, arrays: dict[str, np.ndarray]) -> Splats:
-    """The splats that `pack_splats` named."""
-    return Splats(**{field: arrays[f"{prefix}{field}"] for field in _FIELDS})
 
 
 def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
@@ -292,68 +268,11 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
         for account in accounts:
             identity = after.chronology.templates[account.template].identity
             progress.note(f"{run.capture.visits[t]}: object {identity} {account.kind}")
-        return pack_state(after), {
-            **_state_notes(after),
-            "accounts": [asdict_account(a) for a in accounts],
-            "counts": counts,
-        }
+        arrays, notes = pack_state(after)
+        return arrays, {**notes, "accounts": [a.to_json() for a in accounts], "counts": counts}
 
     arrays, notes = store.run(f"visit_{t:03d}", key, compute)
     return unpack_state(arrays, notes, run.capture.visits), [Account(**a) for a in notes["accounts"]]
-
-
-def asdict_account(account: Account) -> dict:
-    """An account as JSON holds it."""
-    return {
-        "template": account.template,
-        "kind": account.kind,
-        "gain": float(account.gain),
-        "residual": float(account.residual),
-        "views": account.views,
-    }
-
-
-def pack_state(state: State) -> dict[str, np.ndarray]:
-    """A state as arrays by name."""
-    chronology = state.chronology
-    arrays = {
-        **pack_splats("background.", chronology.background),
-        "errors": state.errors,
-        "quat": np.asarray(chronology.world_from_template.quat),
-        "xyz": np.asarray(chronology.world_from_template.xyz),
-        "visible": np.asarray(chronology.visible),
-    }
-    for k, template in enumerate(chronology.templates):
-        arrays |= pack_splats(f"template{k}.", template.splats)
-        arrays[f"template{k}.errors"] = state.template_errors[k]
-        support = state.supports[k]
-        if support is not None:
-            arrays[f"template{k}.support"] = np.asarray([*support.normal, support.offset, support.noise])
-    return arrays
-
-
-def _state_notes(state: State) -> dict:
-    return {"templates": [[m.identity, m.source_visit] for m in state.chronology.templates]}
-
-
-def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, ...]) -> State:
-    """The state that `pack_state` named."""
-    templates, errors, supports = [], [], []
-    for k, (identity, source) in enumerate(notes["templates"]):
-        templates.append(Template(unpack_splats(f"template{k}.", arrays), identity, source))
-        errors.append(arrays[f"template{k}.errors"])
-        packed = arrays.get(f"template{k}.support")
-        supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
-    start = Chronology.of_initial(unpack_splats("background.", arrays), visits)
-    chronology = Chronology(
-        start.background,
-        tuple(templates),
-        SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"])),
-        jnp.asarray(arrays["visible"]),
-        start.exposure,
-        visits,
-    )
-    return State(chronology, arrays["errors"], tuple(errors), tuple(supports))
 
 
 def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chronology:
@@ -365,7 +284,8 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
         later = [(p, view, t) for t in visits for p, view in load_views(run, run.posed(t, "update"), progress)]
         if not state.chronology.templates or not later:
             progress.note("nothing changed: the chronology is the initial scene")
-            return pack_state(state), {**_state_notes(state), "counts": {"steps": 0}}
+            arrays, notes = pack_state(state)
+            return arrays, {**notes, "counts": {"steps": 0}}
         views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
         for _, view, t in later:
             rendered = Eye().image(state.chronology.background, view.camera)
@@ -382,7 +302,8 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
             progress=progress.step,
         )
         fitted = eqx.tree_at(lambda s: s.chronology, state, chronology)
-        return pack_state(fitted), {**_state_notes(fitted), "counts": {"steps": len(losses)}}
+        arrays, notes = pack_state(fitted)
+        return arrays, {**notes, "counts": {"steps": len(losses)}}
 
     arrays, notes = store.run("fit", digest(key, config.fit.long), compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology

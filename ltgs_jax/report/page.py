@@ -14,7 +14,7 @@ from .run import Object, Placement, Run, read_run
 from .shots import Gallery, make_gallery
 from .timeline import legend, timeline
 from .turntable import turntable, up_direction
-from .words import Happening, counted, duration, happenings, number, summary
+from .words import SCORE_WORDS, Happening, caution, counted, duration, happenings, number, summary
 
 _LOW_CONFIDENCE = 0.5
 _MOST_CROPS = 8
@@ -92,7 +92,9 @@ def _happened(run: Run) -> str:
             continue
         entries = "".join(f"<li>{_happening(run, entry)}</li>" for entry in happenings(run, visit))
         body = f'<ul class="happened">{entries}</ul>' if entries else '<p class="soft">Nothing changed.</p>'
-        parts.append(f"<h3>{escape(name)}</h3>{body}")
+        warning = caution(run, visit)
+        told = f'<p class="caution">{escape(warning)}</p>' if warning else ""
+        parts.append(f"<h3>{escape(name)}</h3>{body}{told}")
     return "".join(parts)
 
 
@@ -170,7 +172,7 @@ def _scores(rows: Sequence[dict]) -> str:
     heads = ["visit", "region"]
     for key, row in keys.items():
         unit = "" if row.get("unit") in (None, "", "1") else f" ({row['unit']})"
-        heads.append(f"{key}{unit} {'↑' if row.get('direction') == 'higher' else '↓'}")
+        heads.append(f"{SCORE_WORDS.get(key, key)}{unit} {'↑' if row.get('direction') == 'higher' else '↓'}")
     values = {(row.get("visit"), row.get("region"), row["key"]): row.get("value") for row in rows}
     body = []
     for visit, region in dict.fromkeys((row.get("visit"), row.get("region")) for row in rows):

@@ -10,6 +10,7 @@ from ltgs_jax.io import scaled_size
 
 from .pictures import crop_box, difference, fitted, jpeg, overlay, read_ids, read_shown
 from .run import Run, Shot
+from .words import ROLE_WORDS
 
 _CROP_SIDE = 208  # twice the height at which crops are shown
 _MOST_SHOTS = 120
@@ -130,7 +131,7 @@ def _figure(shot: Shot, layers: dict[str, str], size: tuple[int, int]) -> str:
 
 
 def _scores(shot: Shot) -> str:
-    role = f" · {escape(shot.role)}" if shot.role else ""
+    role = f" · {escape(ROLE_WORDS.get(shot.role, shot.role))}" if shot.role else ""
     if shot.psnr is None:
         return f'<span class="soft">{role}</span>'
     before = "" if shot.initial_psnr is None else f", first visit's scene {shot.initial_psnr:.1f}"

@@ -18,6 +18,11 @@ EVENT_WORDS = {
     "unseen": "was not seen",
 }
 
+ROLE_WORDS = {"train": "fitted", "update": "used", "test": "held out", "unused": "not used"}
+SCORE_WORDS = {"psnr_initial": "psnr of the first visit's scene"}
+_LEAST_TURN = 0.5  # degrees; less would read "turned 0°"
+_POOR_DB = 20.0  # below, a render is a blur in which an object can come or go unseen
+
 
 @dataclass(frozen=True)
 class Happening:
@@ -40,6 +45,19 @@ def happenings(run: Run, visit: int) -> list[Happening]:
 
 def _tells(state: State) -> bool:
     return state.event in CHANGES or (state.event == "unseen" and state.visible)
+
+
+def caution(run: Run, visit: int) -> str | None:
+    """Why the changes of a visit are not to be relied on, where the scores say so."""
+    rows = [row for row in run.metrics if row.get("visit") == run.visits[visit] and row.get("key") == "psnr_initial"]
+    by_region = {row.get("region"): row.get("value") for row in rows}
+    unchanged = by_region.get("static", by_region.get("full"))
+    if not isinstance(unchanged, int | float) or unchanged >= _POOR_DB:
+        return None
+    return (
+        "Even where nothing changed, the first visit's scene resembles these photographs poorly "
+        f"({unchanged:.0f} dB): it is blurred, or the light is another. Changes may have been missed."
+    )
 
 
 def counted(run: Run, visit: int) -> str:
@@ -69,7 +87,7 @@ def _sentence(run: Run, thing: Object, state: State) -> str:
     distance, angle = moved
     length = number(distance) + (f" ({distance / thing.size:.1f} × its size)" if thing.size > 0 else "")
     parts = [f"came back, {length} from where it was" if state.event == "added" else f"{words} by {length}"]
-    if state.ambiguous_axis is None:
+    if state.ambiguous_axis is None and angle >= _LEAST_TURN:
         parts.append(f"turned {angle:.0f}°")
     return ", ".join(parts)
 

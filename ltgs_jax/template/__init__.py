@@ -10,9 +10,11 @@ from .background import fill_under as fill_under
 from .config import TemplateConfig as TemplateConfig
 from .locate import Crop as Crop
 from .locate import Refiner as Refiner
-from .locate import backdrop_error as backdrop_error
+from .locate import explained as explained
 from .locate import make_crop as make_crop
+from .locate import unlikeness as unlikeness
 from .removal import Removal as Removal
 from .removal import find_removed as find_removed
+from .removal import gone_evidence as gone_evidence
 from .support import Support as Support
 from .support import fit_support as fit_support

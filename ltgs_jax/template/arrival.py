@@ -14,18 +14,19 @@ from ltgs_jax.match import Cone, Instance, carve, grid_around
 from ltgs_jax.scene import Splats, Template
 
 from .config import TemplateConfig
-from .locate import Crop, Refiner, backdrop_error, point_colors, score_points
-from .support import Support, fit_support
+from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of
+from .support import Support, fit_support, rotation_about
 
 
 class Placement(eqx.Module):
-    """A template found again: its pose, the mean colour error with it, the share of the change it explains, and the
-    share of its outlines that lies on the change."""
+    """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
+    its outlines that lies on the change, and its structural likeness to the photographs."""
 
     world_from_template: SE3
     error: float
     gain: float
     overlap: float
+    likeness: float
 
 
 def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -40,11 +41,6 @@ def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Fl
     return np.eye(3) + skew + skew @ skew / (1 + cosine)
 
 
-def _turn(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
-
-
 def pose_hypotheses(
     template: Float[np.ndarray, "n 3"],
     stood_on: Support,
@@ -57,17 +53,18 @@ def pose_hypotheses(
 ) -> SE3:
     """Poses of a template (points in its frame, on `stood_on`) on another support around `place` (scene units).
 
-    For each tilt and each of `turns` turns about the normal: a 7 × 7 grid of places, `spread` wide; the lowest points
-    touch the support.
+    For each tilt and each of `turns` turns about the normal: the place itself and two rings of places around it, 0.35
+    and 0.8 `spread` wide; the lowest points touch the support.
     """
     center = np.median(template, axis=0)
     align = rotation_between(stood_on.normal, stands_on.normal)
     axes = stands_on.frame()
-    offsets = [np.zeros(3)] + [spread * (np.cos(a) * axes[0] + np.sin(a) * axes[1]) for a in np.arange(8) * np.pi / 4]
+    ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
+    offsets = [np.zeros(3), *[0.35 * spread * r for r in ring], *[0.8 * spread * r for r in ring]]
     matrices = []
     for tilt in tilts:
         for turn in range(turns):
-            rotation = _turn(stands_on.normal, 2 * np.pi * turn / turns) @ align @ tilt
+            rotation = rotation_about(stands_on.normal, 2 * np.pi * turn / turns) @ align @ tilt
             height = stands_on.height((template - center) @ rotation.T)
             rest = place - stands_on.normal * (stands_on.height(place[None])[0])
             lift = -(np.quantile(height, 0.02) + stands_on.offset) * stands_on.normal
@@ -82,7 +79,13 @@ def pose_hypotheses(
 def tilts_of(support: Support) -> list[Float[np.ndarray, "3 3"]]:
     """The rotations that lay an object on each of its other five sides."""
     u, v, _ = support.frame()
-    return [_turn(u, np.pi / 2), _turn(u, -np.pi / 2), _turn(v, np.pi / 2), _turn(v, -np.pi / 2), _turn(u, np.pi)]
+    return [
+        rotation_about(u, np.pi / 2),
+        rotation_about(u, -np.pi / 2),
+        rotation_about(v, np.pi / 2),
+        rotation_about(v, -np.pi / 2),
+        rotation_about(u, np.pi),
+    ]
 
 
 def thin(splats: Splats, most: int) -> Splats:
@@ -100,7 +103,7 @@ def thin(splats: Splats, most: int) -> Splats:
 
 
 class Search(eqx.Module):
-    """Promising poses of a template and the mean colour error with it at each, by points alone; the error `without`
+    """Promising poses of a template and the mean unlikeness with it at each, in coarse windows; the error `without`
     it, and the part of that which is to be explained."""
 
     template: Splats
@@ -109,14 +112,10 @@ class Search(eqx.Module):
     without: float
     change: float
 
-    def gain(self, error: float) -> float:
-        """Share of the change that is explained when `error` is left; what is drawn beside it counts against."""
-        return (self.without - error) / max(self.change, 1e-9)
-
     @property
     def best_gain(self) -> float:
-        """The gain of the best of the poses."""
-        return self.gain(float(self.errors.min()))
+        """Share of the change that the best of the poses explains; what is drawn beside it counts against."""
+        return (self.without - float(self.errors.min())) / max(self.change, 1e-9)
 
 
 def search_template(
@@ -127,51 +126,49 @@ def search_template(
     crop: Crop,
     *,
     size: float,
+    refiner: Refiner,
+    rng: np.random.Generator,
+    before: SE3 | None = None,
+    upright: bool = False,
     config: TemplateConfig = TemplateConfig(),
 ) -> Search:
-    """Poses at which a template's points, at many turns and places on the support, look like the photographs.
+    """Poses at which a template, rendered at many turns and places on the support, looks like the photographs.
 
-    Upright first; on its other sides too if upright explains little. The best four, unlike each other.
+    Upright first, and at its pose `before`; unless `upright`, on its other sides too if upright explains little. The
+    best few, unlike each other.
     """
     light = thin(template.splats, config.search_splats)
-    shown = np.asarray(light.opacities) > 0.1
-    points, colors = np.asarray(light.means, np.float64)[shown], point_colors(light)[shown]
-    without, change = backdrop_error(crop)
+    points = np.asarray(light.means, np.float64)[np.asarray(light.opacities) > 0.1]
+    coarse = half_crop(crop)
+    without, change = backdrop_error(coarse)
     best: Search | None = None
-    for tilts in ([np.eye(3)], tilts_of(stood_on)):
-        hypotheses = pose_hypotheses(
-            points, stood_on, stands_on, place, turns=config.yaw_steps, spread=size, tilts=tilts
+    for tilts, turns in (([np.eye(3)], config.yaw_steps), (tilts_of(stood_on), config.yaw_steps // 2)):
+        hypotheses = pose_hypotheses(points, stood_on, stands_on, place, turns=turns, spread=size, tilts=tilts)
+        if before is not None:
+            hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
+        scores = refiner.score(light, hypotheses, coarse, tolerance=0.1 * size)
+        chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
+        poses, errors = refiner.slide(
+            light, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, tolerance=0.1 * size, rng=rng
         )
-        scores = score_points(points, colors, hypotheses, crop, tolerance=0.1 * size)
-        chosen = _unlike(hypotheses, scores, 4, distance=0.1 * size, angle=0.4)
-        found = Search(light, hypotheses[chosen], scores[chosen], without, change)
+        order = np.argsort(errors, kind="stable")
+        found = Search(light, poses[order], errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():
             best = found
-        if best.best_gain > config.tau_gain:
+        if upright or best.best_gain > config.tau_search:
             break
     assert best is not None
     return best
 
 
-def settle_template(search: Search, stands_on: Support, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """Refine the poses of a search on the pixels, then try the best of them turned by quarters: things that look alike
-    from two sides settle on the wrong one easily."""
+def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
+    """Refine the best two poses of a search on the pixels, in all six freedoms."""
     tolerance = 0.1 * size
-    found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=tolerance)
-    winner = found.poses[int(np.argmin(found.errors))]
-    means = np.asarray(search.template.means)[np.asarray(search.template.opacities) > 0.1]
-    center = np.asarray(winner.apply(jnp.asarray(np.median(means, axis=0))[None]))[0]
-    turned = []
-    for quarter in range(4):
-        turn = np.eye(4)
-        turn[:3, :3] = _turn(stands_on.normal, quarter * np.pi / 2)
-        turn[:3, 3] = center - turn[:3, :3] @ center
-        turned.append(turn @ np.asarray(winner.as_matrix()))
-    quarters = SE3.from_matrix(jnp.asarray(np.stack(turned), jnp.float32))
-    again = refiner.refine(search.template, quarters, crop, size=size, tolerance=tolerance)
-    best = int(np.argmin(again.errors))
-    error = float(again.errors[best])
-    return Placement(again.poses[best], error, search.gain(error), float(again.overlaps[best]))
+    found = refiner.refine(search.template, search.poses[:2], crop, size=size, tolerance=tolerance, steps=12, blurred=3)
+    pose = found.poses[int(np.argmin(found.errors))]
+    images, cover = refiner.images(search.template, pose[None], crop, tolerance)
+    error, gain = explained(images[0], crop)
+    return Placement(pose, error, gain, float(overlap_of(cover > 0.5, crop)[0]), likeness(images[0], cover[0], crop))
 
 
 def _unlike(

@@ -11,29 +11,41 @@ class TemplateConfig:
     """Smallest evidence for an object, as a share of a photograph's pixels."""
     flat: float = 3.0
     """What rises above its support by less than this many times the support's noise is no object."""
+    whole: float = 0.25
+    """Share of the evidence on a thing that stands apart which must say that it left, for all of it to go."""
+    cut_color: float = 0.5
+    """Colour difference, in 0…1, at which two near splats are hardly taken to be of one object."""
     fill_splats: int = 2500
     """Most splats laid where an object's removal bares the surface below."""
     hull_resolution: int = 40
     """Voxels along the longest edge of a new object's visual hull."""
     new_splats: int = 2048
     """Most splats a new object starts with."""
-    tau_new: float = 0.4
+    tau_new: float = 0.65
     """Share of the change that a new object must explain after its short fit."""
-    faint: float = 0.05
-    """Mean colour difference, in 0…1, below which what changed is no object."""
     new_steps: int = 80
     """Steps of the short fit of a new object, before its template is used."""
     new_opacity: float = 0.1
     """Opacity a new object's splats start with (the paper's)."""
-    yaw_steps: int = 24
+    still_margin: float = 0.03
+    """Relative unlikeness that an account must save before something that left is not taken to be still there."""
+    yaw_steps: int = 16
     """Turns about the support's normal tried for a known template."""
+    starts: int = 6
+    """Poses, unlike each other, that are followed further."""
     window: int = 56
     """Pixels along the edge of the windows in which poses are compared."""
     candidates: int = 2
     """Known templates, best by points, whose pose is refined for one arrival."""
     search_splats: int = 1024
     """Splats of a template while its pose is sought."""
-    tau_gain: float = 0.4
+    tau_search: float = 0.25
+    """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
+    tau_gain: float = 0.25
     """Share of the photometric error that a known template must explain to be taken for what came."""
+    tau_likeness: float = 0.4
+    """Structural likeness to the photographs, in the middle view, from which on a known template is what came."""
+    tau_remains: float = 0.35
+    """Share of the change that may still be seen where a known template is put, for it to be what came."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that lies on what changed."""

@@ -1,6 +1,6 @@
 """Where a known template stands now: show it at many poses, compare with all photographs of the visit at once.
 
-First as bare points with a depth buffer, at hundreds of poses; then the best few as splats, by Levenberg–Marquardt.
+First at hundreds of poses in small windows; then the best few descend, by Levenberg–Marquardt on the pixels.
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
-from ltgs_jax.geometry import C0, SE3, Camera, stack_cameras
+from ltgs_jax.geometry import SE3, Camera, stack_cameras
 from ltgs_jax.render import RenderPlan, plan_render, render
 from ltgs_jax.scene import Splats
+
+from .support import rotation_about
 
 
 class Crop(eqx.Module):
@@ -41,6 +43,12 @@ def crop_camera(camera: Camera, box: tuple[float, float, float], size: int) -> C
     return Camera(camera.cam_from_world, zoom * (shift @ camera.K), size, size)
 
 
+def _blocks(image: Float[np.ndarray, "h w *c"], step: int) -> Float[np.ndarray, "h2 w2 *c"]:
+    """Means over blocks of `step` × `step` pixels; a remainder at the right and bottom is left out."""
+    h, w = image.shape[0] // step, image.shape[1] // step
+    return image[: h * step, : w * step].reshape(h, step, w, step, *image.shape[2:]).mean(axis=(1, 3))
+
+
 def make_crop(
     cameras: Sequence[Camera],
     targets: Sequence[np.ndarray],
@@ -56,6 +64,9 @@ def make_crop(
 
     def cut(image: np.ndarray, box) -> np.ndarray:
         left, top, side = box
+        step = min(int(side / size), min(image.shape[:2]) // 8)
+        if step > 1:  # what the window leaves out must not alias: means over whole blocks of pixels first
+            image, left, top, side = _blocks(image, step), left / step, top / step, side / step
         position = (np.arange(size) + 0.5) * side / size - 0.5
         rows, columns = top + position, left + position
         inside = ((rows > -0.5) & (rows < image.shape[0] - 0.5))[:, None] & (
@@ -83,6 +94,26 @@ def make_crop(
     )
 
 
+def half_crop(crop: Crop) -> Crop:
+    """The same windows at half their size, by means over 2 × 2 pixels; those count that count whole."""
+
+    def mean(leaf):
+        v, s = leaf.shape[:2]
+        return leaf.reshape(v, s // 2, 2, s // 2, 2, *leaf.shape[3:]).mean(axis=(2, 4))
+
+    camera = crop.camera
+    size = camera.width // 2
+    K = camera.K * jnp.asarray([[0.5], [0.5], [1]], camera.K.dtype)
+    return Crop(
+        camera=Camera(camera.cam_from_world, K, size, size),
+        target=mean(crop.target),
+        backdrop=mean(crop.backdrop),
+        depth=mean(crop.depth),
+        valid=mean(crop.valid.astype(jnp.float32)) > 0.99,
+        region=mean(crop.region.astype(jnp.float32)) > 0.5,
+    )
+
+
 def posed(cameras: Camera, world_from_template: SE3) -> Camera:
     """Cameras that see a template, left in its own frame, as `cameras` [v] see it at poses [m]: batched [m·v]."""
     m, v = world_from_template.xyz.shape[0], cameras.K.shape[0]
@@ -91,83 +122,74 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
     return Camera(tile.cam_from_world @ spread, tile.K, cameras.width, cameras.height)
 
 
-_CAP = 0.4  # colour error at which a pixel is simply wrong, however wrong
+_BATCH = 64  # poses rendered in one call of a search
+_CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
+
+
+@eqx.filter_jit
+def unlikeness(
+    images: Float[Array, "m v h w 3"], target: Float[Array, "v h w 3"], valid: Bool[Array, "v h w"]
+) -> Float[Array, "m v h w"]:
+    """How unlike the photographs `target` each pixel of the renders is, 0…1: half by colour, capped, half by structure,
+    which survives other shading; 0 where a pixel does not count."""
+    colour = jnp.minimum(jnp.mean(jnp.abs(images - target), axis=-1), _CAP) / _CAP
+    structure = 1 - _structure(jnp.mean(images, axis=-1), jnp.mean(target, axis=-1))
+    return (0.5 * colour + 0.5 * jnp.clip(structure, 0, 1)) * valid
+
+
+def _structure(a: Float[Array, "m v s s"], b: Float[Array, "v s s"]) -> Float[Array, "m v s s"]:
+    """Covariance over variances of two grey images in binomial windows of 7 px: SSIM without its luminance term."""
+    mean_a, mean_b = _window_mean(a), _window_mean(b)
+    var_a, var_b = _window_mean(a * a) - mean_a**2, _window_mean(b * b) - mean_b**2
+    covariance = _window_mean(a * b) - mean_a * mean_b
+    floor = 0.03**2
+    return (2 * covariance + floor) / (jnp.maximum(var_a, 0) + jnp.maximum(var_b, 0) + floor)
+
+
+def _window_mean(image: Float[Array, "*b h w"]) -> Float[Array, "*b h w"]:
+    """Binomial mean over 7 × 7 pixels, the border's repeated."""
+    for axis in (image.ndim - 2, image.ndim - 1):
+        padded = jnp.pad(image, [(3, 3) if i == axis else (0, 0) for i in range(image.ndim)], mode="edge")
+        taps = [jax.lax.slice_in_dim(padded, i, i + image.shape[axis], axis=axis) for i in range(7)]
+        image = (taps[0] + taps[6] + 6 * (taps[1] + taps[5]) + 15 * (taps[2] + taps[4]) + 20 * taps[3]) / 64
+    return image
+
+
+def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop) -> float:
+    """Mean structural agreement where the template shows, −1…1, in the middle of the views that show enough of it."""
+    agreement = np.asarray(_structure(jnp.mean(images, axis=-1)[None], jnp.mean(crop.target, axis=-1)))[0]
+    shown = (cover > 0.5) & np.asarray(crop.valid)
+    pixels = shown.sum(axis=(1, 2))
+    enough = pixels > max(0.2 * pixels.max(), 8)
+    if not enough.any():
+        return -1.0
+    means = np.sum(agreement * shown, axis=(1, 2))[enough] / pixels[enough]
+    return float(np.median(means))
 
 
 def backdrop_error(crop: Crop) -> tuple[float, float]:
-    """Mean over views of the colour error, capped at 0.4, with nothing added to the backdrop; and the part of it that
-    lies where the object is."""
-    empty = np.asarray(crop.backdrop)[None]
-    inside = np.where(np.asarray(crop.region)[..., None], empty, np.asarray(crop.target))
-    return float(np.mean(_view_errors(empty, crop))), float(np.mean(_view_errors(inside, crop)))
+    """Mean over views of the unlikeness with nothing added to the backdrop; and the part of it that lies where the
+    object is."""
+    wrong = _unlike_crop(np.asarray(crop.backdrop)[None], crop)
+    inside = np.where(np.asarray(crop.region), wrong, 0)
+    return float(_view_errors(wrong, crop).mean()), float(_view_errors(inside, crop).mean())
 
 
-def _view_errors(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v"]:
-    """Mean capped colour error over the pixels that count."""
-    difference = np.minimum(np.abs(images - np.asarray(crop.target)).mean(axis=-1), _CAP)
-    valid = np.asarray(crop.valid)
-    return np.sum(difference * valid, axis=(2, 3)) / np.maximum(valid.sum(axis=(1, 2)), 1)
+def _unlike_crop(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
+    return np.asarray(unlikeness(images, crop.target, crop.valid))
 
 
-def score_points(
-    points: Float[np.ndarray, "n 3"],
-    colors: Float[np.ndarray, "n 3"],
-    poses: SE3,
-    crop: Crop,
-    *,
-    tolerance: float,
-) -> Float[np.ndarray, " m"]:
-    """Colour error, averaged over views, with the points drawn 2 × 2 px at each of m poses, nearest in front.
-
-    Coarse, but thousands of poses cost seconds and no compilation. `tolerance` in scene units: how far behind the known
-    surface a point still shows.
-    """
-    matrices = np.asarray(poses.as_matrix(), np.float64)
-    base = np.asarray(crop.camera.cam_from_world.as_matrix(), np.float64)
-    K = np.asarray(crop.camera.K, np.float64)
-    size = crop.depth.shape[-1]
-    target, valid = np.asarray(crop.target), np.asarray(crop.valid)
-    backdrop, depth = np.asarray(crop.backdrop), np.asarray(crop.depth)
-    limit = np.where(depth > 0, depth + tolerance, np.inf)
-    errors = np.zeros((len(matrices), len(base)))
-    for v in range(len(base)):
-        empty = np.minimum(np.abs(backdrop[v] - target[v]).mean(axis=-1), _CAP) * valid[v]
-        projection = K[v] @ (base[v] @ matrices)[:, :3]
-        local = points @ np.swapaxes(projection[:, :, :3], 1, 2) + projection[:, None, :, 3]
-        z = local[..., 2]
-        safe = np.where(z > 1e-6, z, 1)
-        column, row = np.floor(local[..., 0] / safe - 0.5).astype(int), np.floor(local[..., 1] / safe - 0.5).astype(int)
-        nearest = np.full((len(matrices), size * size), np.inf, np.float64)
-        winner = np.full((len(matrices), size * size), -1)
-        order = np.argsort(-z, axis=1, kind="stable")
-        pose = np.arange(len(matrices))[:, None]
-        for dy, dx in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            r, c = row + dy, column + dx
-            good = (z > 1e-6) & (r >= 0) & (r < size) & (c >= 0) & (c < size)
-            cell = np.where(good, r * size + c, 0)
-            good &= z < limit[v].ravel()[cell]
-            ordered = np.take_along_axis(np.where(good, cell, -1), order, axis=1)
-            far_to_near = np.take_along_axis(z, order, axis=1)
-            rows = np.broadcast_to(pose, ordered.shape)
-            keep = ordered >= 0
-            # Later assignments win, and the nearest points come last; the four offsets are merged by depth.
-            layer = np.full_like(winner, -1)
-            layer[rows[keep], ordered[keep]] = order[keep]
-            depths = np.full_like(nearest, np.inf)
-            depths[rows[keep], ordered[keep]] = far_to_near[keep]
-            nearer = depths < nearest
-            winner = np.where(nearer, layer, winner)
-            nearest = np.where(nearer, depths, nearest)
-        drawn = winner >= 0
-        difference = np.minimum(np.abs(colors[winner] - target[v].reshape(-1, 3)).mean(axis=-1), _CAP)
-        difference = np.where(drawn, difference * valid[v].ravel(), empty.ravel())
-        errors[:, v] = difference.sum(axis=1) / max(valid[v].sum(), 1)
-    return errors.mean(axis=1)
+def explained(images: Float[np.ndarray, "v s s 3"], crop: Crop) -> tuple[float, float]:
+    """Mean unlikeness with something added to the backdrop, and the share of the change that it explains; what is drawn
+    beside the change counts against."""
+    without, change = backdrop_error(crop)
+    error = float(_view_errors(_unlike_crop(images[None], crop), crop).mean())
+    return error, (without - error) / max(change, 1e-9)
 
 
-def point_colors(splats: Splats) -> Float[np.ndarray, "n 3"]:
-    """Mean colour of each splat over directions."""
-    return np.clip(np.asarray(splats.sh[:, 0]) * C0 + 0.5, 0, 1)
+def _view_errors(wrong: Float[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, "m v"]:
+    """Mean unlikeness over the pixels that count."""
+    return np.sum(wrong, axis=(2, 3)) / np.maximum(np.asarray(crop.valid).sum(axis=(1, 2)), 1)
 
 
 @eqx.filter_jit
@@ -183,16 +205,25 @@ def _composites(template: Splats, poses: SE3, crop: Crop, tolerance, plan: Rende
     return image + (1 - cover)[..., None] * crop.backdrop, cover, out.overflow
 
 
-def _overlap(covered: Bool[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, " m"]:
+def overlap_of(covered: Bool[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, " m"]:
     """Share of the outlines that lies on what changed, pooled over the views that have a region."""
     region, valid = np.asarray(crop.region), np.asarray(crop.valid)
     used = valid & region.any(axis=(1, 2), keepdims=True)
     return np.sum(covered & region & used, axis=(1, 2, 3)) / np.maximum(np.sum(covered & used, axis=(1, 2, 3)), 1)
 
 
+def _slid(pose, center, shift, normal, angle):
+    """A pose [4 4] turned by `angle` about `normal` through the posed `center` and then shifted."""
+    pivot = pose[:3, :3] @ center + pose[:3, 3]
+    turn = np.asarray(rotation_about(normal, angle))
+    moved = np.eye(4)
+    moved[:3, :3] = turn @ pose[:3, :3]
+    moved[:3, 3] = turn @ (pose[:3, 3] - pivot) + pivot + shift
+    return moved
+
+
 class Refinement(eqx.Module):
-    """Poses after descent, the mean capped colour error of each, and the share of its outlines that
-    lies on what changed."""
+    """Poses after descent, the mean unlikeness of each, and the share of its outlines that lies on what changed."""
 
     poses: SE3
     errors: Float[np.ndarray, " m"]
@@ -226,13 +257,61 @@ class Refiner:
                 max(plan.intersections, needed.intersections) * 3 // 2, max(plan.rounds, needed.rounds) * 3 // 2
             )
 
+    def score(self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float) -> Float[np.ndarray, " m"]:
+        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`."""
+        m = poses.xyz.shape[0]
+        errors = []
+        for start in range(0, m, _BATCH):
+            index = np.minimum(np.arange(start, start + _BATCH), m - 1)
+            images, _ = self.images(template, poses[index], crop, tolerance)
+            errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
+        return np.concatenate(errors)[:m]
+
+    def slide(
+        self,
+        template: Splats,
+        poses: SE3,
+        crop: Crop,
+        *,
+        normal: Float[np.ndarray, "3"],
+        size: float,
+        tolerance: float,
+        rng: np.random.Generator,
+        rounds: int = 6,
+    ) -> tuple[SE3, Float[np.ndarray, " m"]]:
+        """Each of m poses moved over the surface of unit `normal` and turned about it, to where it is least unlike the
+        photographs: in every round the best of random steps around it, steps shrinking. Returns poses and unlikeness.
+
+        Two in-plane shifts and a turn: the other three freedoms would let a wrong pose sink or tilt to please.
+        """
+        m = poses.xyz.shape[0]
+        center = np.median(np.asarray(template.means)[np.asarray(template.opacities) > 0.1], axis=0)
+        axes = np.linalg.svd(normal[None])[2][1:]
+        best, best_errors = np.asarray(poses.as_matrix(), np.float64), np.full(m, np.inf)
+        tries = _BATCH // m
+        for r in range(rounds):
+            steps = rng.normal(size=(m, tries, 3)) * np.array([0.25 * size, 0.25 * size, 0.35]) * 0.65**r
+            steps[:, 0] = 0
+            trial = np.stack(
+                [
+                    [_slid(best[i], center, steps[i, j, :2] @ axes, normal, steps[i, j, 2]) for j in range(tries)]
+                    for i in range(m)
+                ]
+            )
+            flat = SE3.from_matrix(jnp.asarray(trial.reshape(-1, 4, 4), jnp.float32))
+            errors = self.score(template, flat, crop, tolerance=tolerance).reshape(m, tries)
+            winner = errors.argmin(axis=1)
+            best, best_errors = trial[np.arange(m), winner], errors[np.arange(m), winner]
+        return SE3.from_matrix(jnp.asarray(best, jnp.float32)), best_errors
+
     def refine(
-        self, template: Splats, poses: SE3, crop: Crop, *, size: float, tolerance: float, steps: int = 12
+        self, template: Splats, poses: SE3, crop: Crop, *, size: float, tolerance: float, steps: int, blurred: int = 0
     ) -> Refinement:
         """Descend from each of m poses. `size`: the template's diameter in scene units.
 
-        Residuals are colour differences with Geman–McClure weights (scale 0.15); the first third of the steps sees
-        them blurred, which widens the basin. A step that does not pay is taken back and damped more.
+        Residuals are differences of colour and of grey detail with Geman–McClure weights (scale 0.15); the first
+        `blurred` steps see them blurred, which widens the basin. A step that does not pay is taken back and damped
+        more.
         """
         m = poses.xyz.shape[0]
         delta = np.r_[np.full(3, 0.01 * size), np.full(3, 0.02)]
@@ -246,16 +325,21 @@ class Refiner:
         valid = np.asarray(crop.valid)[None, None, ..., None]
         target = np.asarray(crop.target)
         for step in range(steps):
-            if step == steps // 3:
+            if step == blurred:
                 best_cost[:] = np.inf
-            blur = 1.5 if step < steps // 3 else 0.0
+            blur = 1.5 if step < blurred else 0.0
             spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), 7, axis=0), trial)
             spread = spread @ SE3.exp(jnp.asarray(np.tile(probes, (m, 1)), jnp.float32))
             images, cover = self.images(template, spread, crop, tolerance)
             images = images.reshape(m, 7, *images.shape[1:])
-            errors = _view_errors(images[:, 0], crop).mean(axis=1)
-            overlaps = _overlap(cover.reshape(m, 7, *cover.shape[1:])[:, 0] > 0.5, crop)
+            errors = _view_errors(_unlike_crop(images[:, 0], crop), crop).mean(axis=1)
+            overlaps = overlap_of(cover.reshape(m, 7, *cover.shape[1:])[:, 0] > 0.5, crop)
             residual = (images - target) * valid
+            # Colours for where it stands; what is left of the greys without their local mean for the rest: that
+            # stays when the object is shaded otherwise.
+            grey = residual.mean(axis=-1, keepdims=True)
+            detail = grey - ndimage.gaussian_filter(grey, (0, 0, 0, 3, 3, 0), truncate=2)
+            residual = np.concatenate([0.5 * residual, 2 * detail], axis=-1)
             if blur:
                 residual = ndimage.gaussian_filter(residual, (0, 0, 0, blur, blur, 0), truncate=2)
             flat = residual.reshape(m, 7, -1)

@@ -2,7 +2,7 @@
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from ltgs_jax.geometry import C0
@@ -12,35 +12,38 @@ from .config import TemplateConfig
 from .cut import components, neighbour_graph, random_walk
 from .support import Support, convex_footprint, fit_support
 
+_LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
+_MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
+
 
 class Removal(eqx.Module):
-    """Splats of the scene that left together: mask over the scene, the surface they stood on, votes in pixels, and the
-    number of photographs with enough of them."""
+    """Splats of the scene that left together: mask over the scene, the surface they stood on, votes in pixels, their
+    share of the evidence on these splats, and the number of photographs with enough of them."""
 
     members: Bool[np.ndarray, " n"]
     support: Support | None
     votes: float
+    share: float
     views: int = eqx.field(static=True)
 
 
 def gone_evidence(
-    seen: Float[np.ndarray, "v n"], changed: Float[np.ndarray, "v n"], *, least_votes: float = 0.3
+    seen: Float[np.ndarray, "v n"], evidence: Float[np.ndarray, "v n"]
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Evidence that each splat left, and that it stayed, in pixels.
 
-    A splat left only if *every* photograph that sees it (by its votes αT) shows change there: what merely hides it in
-    one photograph does not in another.
+    `seen` Σ αT per photograph, `evidence` Σ αT·e of the photograph's evidence e in −1…1. What is unchanged in one
+    photograph counts twice: something that came hides a splat in one photograph, and not in the others.
     """
-    share = np.where(seen > least_votes, changed / np.maximum(seen, 1e-9), 1.0)
-    least = share.min(axis=0)
-    total = np.where((seen > least_votes).any(axis=0), seen.sum(axis=0), 0)
-    return total * np.clip(2 * least - 1, 0, 1), total * np.clip(1 - 2 * least, 0, 1)
+    mean = np.where(seen > _LEAST_VOTES, evidence / np.maximum(seen, 1e-9), 0)
+    total = np.sum(np.minimum(seen, _MOST_VOTES) * np.where(mean < 0, 2 * mean, mean), axis=0)
+    return np.maximum(total, 0), np.maximum(-total, 0)
 
 
 def find_removed(
     splats: Splats,
     seen: Float[np.ndarray, "v n"],
-    changed: Float[np.ndarray, "v n"],
+    evidence: Float[np.ndarray, "v n"],
     cameras: Float[np.ndarray, "v 3"],
     *,
     pixels: int,
@@ -49,34 +52,35 @@ def find_removed(
 ) -> list[Removal]:
     """Cut out what left, one `Removal` for each solid thing, largest first.
 
-    Evidence from the votes spreads over a graph of near and like splats to the sides that no photograph saw; what does
-    not rise above its support (a shadow, the ground under something new) is no object.
+    Splats with evidence of having left are grouped; around each group, above the surface it stands on, the evidence
+    spreads over a graph of near splats to the sides that no photograph saw. What does not rise above its support (a
+    shadow, the ground under something new) is no object.
     """
-    left, stayed = gone_evidence(seen, changed)
+    left, stayed = gone_evidence(seen, evidence)
+    changed = np.maximum(evidence, 0)
     least = config.min_pixels * pixels
     if left.sum() < least:
         return []
     means = np.asarray(splats.means, np.float64)
     colors = np.asarray(splats.sh[:, 0]) * C0 + 0.5
-    graph = neighbour_graph(means, colors)
-    probability = random_walk(graph, np.minimum(left, 5), np.minimum(stayed, 5))
-    members = np.flatnonzero((probability > 0.5) & (stayed <= left))
-    removals = []
-    for group in _groups(means, members):
+    removals, taken = [], np.zeros(len(means), bool)
+    for group in sorted(_groups(means, np.flatnonzero(left > 0.5)), key=lambda g: -left[g].sum()):
+        group = group[~taken[group]]
         if left[group].sum() < least:
             continue
-        lifted = _lift(means, group, left, stayed, cameras, rng, config)
-        if lifted is None:
-            continue
-        members, support = lifted
-        views, votes = int(np.sum(changed[:, members].sum(axis=1) >= least)), float(left[members].sum())
-        # One photograph alone may only have something in front of it: it must show more, and solid ground below.
-        if views >= 2 or (views == 1 and support is not None and votes >= 3 * least):
-            removals.append(Removal(members, support, votes, views))
+        for members, support in _solids(splats, colors, group, left, stayed, cameras, rng, config):
+            members = members & ~taken
+            votes = float(left[members].sum())
+            views = int(np.sum(changed[:, members].sum(axis=1) >= least))
+            # One photograph alone may only have something in front of it: it must show more, and solid ground below.
+            if votes >= least and (views >= 2 or (views == 1 and support is not None and votes >= 3 * least)):
+                share = votes / (votes + float(stayed[members].sum()))
+                removals.append(Removal(members, support, votes, share, views))
+                taken |= members
     return sorted(removals, key=lambda r: -r.votes)
 
 
-def _groups(means: Float[np.ndarray, "n 3"], members: np.ndarray, reach: float = 3.0) -> list[np.ndarray]:
+def _groups(means: Float[np.ndarray, "n 3"], members: Int[np.ndarray, " m"], reach: float = 3.0) -> list[np.ndarray]:
     """Members nearer to each other than `reach` times their usual distance."""
     if len(members) < 8:
         return []
@@ -85,30 +89,84 @@ def _groups(means: Float[np.ndarray, "n 3"], members: np.ndarray, reach: float =
     return [members[labels == i] for i in range(labels.max() + 1) if (labels == i).sum() >= 8]
 
 
-def _lift(means, group, left, stayed, cameras, rng, config: TemplateConfig):
-    """One group without the surface it stands on, and with the unseen splats that stand among it."""
-    center = means[group].mean(axis=0)
+def _islands(
+    splats: Splats, height: Float[np.ndarray, " n"], local: Int[np.ndarray, " m"], floor: float, axes
+) -> list[Int[np.ndarray, " p"]]:
+    """Things that stand apart above a surface, each an array of indices among `local`.
+
+    What is firm and clear of the surface makes an island; what is faint or low joins the one whose outline it is in.
+    """
+    means = np.asarray(splats.means, np.float64)
+    firm = local[(np.asarray(splats.opacities)[local] > 0.2) & (height[local] > 2 * floor)]
+    rest = np.setdiff1d(local, firm)
+    islands = []
+    for island in _groups(means, firm, reach=2.0):
+        inside = _within_outline(means, island, rest, axes) & (height[rest] < 1.1 * height[island].max())
+        islands.append(np.concatenate([island, rest[inside]]))
+        rest = rest[~inside]
+    return islands
+
+
+def _within_outline(means, body, queries, axes) -> Bool[np.ndarray, " q"]:
+    """Which splats lie over the convex outline, a tenth wider, that a body has on its support."""
+    flat = means[body] @ axes.T
+    return convex_footprint((flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0), means[queries] @ axes.T)
+
+
+def _parts(splats, colors, height, local, body, floor, axes, left, stayed, config: TemplateConfig) -> list[np.ndarray]:
+    """What of the `local` splats above a support left, one array of indices for each solid thing.
+
+    A thing that stands apart goes as a whole once a good part of it is seen to have changed: turned or shifted a
+    little, it still has its own colours in many places. What touches its neighbours is cut from them by a random walk.
+    """
+    means = np.asarray(splats.means, np.float64)
+    size = np.linalg.norm(np.ptp(means[body], axis=0))
+    parts, rest = [], local
+    for island in _islands(splats, height, local, floor, axes):
+        told = left[island].sum() / max((left + stayed)[island].sum(), 1e-9)
+        alone = np.linalg.norm(np.ptp(means[island], axis=0)) < 2 * size
+        if told > config.whole and alone and left[island].sum() > 0.1 * left[body].sum():
+            parts.append(island)
+            rest = np.setdiff1d(rest, island)
+    if len(np.intersect1d(rest, body)) >= 8:
+        graph = neighbour_graph(means[rest], colors[rest], color_scale=config.cut_color)
+        # Capped, so that a splat that straddles the outline goes with its neighbours.
+        probability = random_walk(graph, np.minimum(left[rest], 2), np.minimum(stayed[rest], 2))
+        parts += _groups(means, rest[probability > 0.5])
+    return [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+
+
+def _solids(splats: Splats, colors, group, left, stayed, cameras, rng, config: TemplateConfig):
+    """The solid things in one group: masks of splats, with what is under them on the surface they stand on."""
+    means = np.asarray(splats.means, np.float64)
+    center = np.median(means[group], axis=0)
     radius = np.linalg.norm(means[group] - center, axis=1).max() + 1e-9
     near = np.linalg.norm(means - center, axis=1) < 3 * radius
     ground = near & (stayed > 0.5)
     support = fit_support(means[ground], np.minimum(stayed[ground], 5) + 1e-3, means[group], cameras, rng=rng)
-    members = np.zeros(len(means), bool)
     if support is None:
+        members = np.zeros(len(means), bool)
         members[group] = True
-        return members, None
-    height = support.height(means)
+        return [(members, None)]
+    height, axes = support.height(means), support.frame()[:2]
     top = np.quantile(height[group], 0.95)
     floor = max(config.flat * support.noise, 0.05 * top)
-    if top < floor * 1.5 or np.sum(left[group] * (height[group] > floor)) < 0.2 * left[group].sum():
-        return None
     body = group[height[group] > floor]
-    axes = support.frame()[:2]
-    # What is under the body goes with it, its contact with the support included: the fill replaces that.
-    inside = near & (height > -floor) & (height < 1.1 * top) & (stayed <= left)
-    index = np.flatnonzero(inside)
-    flat = means[body] @ axes.T
-    footprint = (flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0)
-    index = index[convex_footprint(footprint, means[index] @ axes.T)]
-    members[body] = True
-    members[index] = True
-    return members, support
+    if len(body) < 8 or top < floor * 1.5 or left[body].sum() < 0.2 * left[group].sum():
+        return []
+    local = np.flatnonzero(near & (height > floor))
+    parts = _parts(splats, colors, height, local, body, floor, axes, left, stayed, config)
+    # What is under the body goes with it, its contact with the support included: the fill replaces that. So do splats
+    # within its outline that nothing says stayed.
+    free = near & (height > -floor) & (height < 1.1 * top) & (stayed <= left)
+    free[np.concatenate([*parts, np.zeros(0, int)])] = False
+    found = []
+    for part in parts:
+        below = np.flatnonzero(free)
+        below = below[_within_outline(means, part, below, axes)]
+        free[below] = False
+        members = np.zeros(len(means), bool)
+        members[part] = True
+        members[below] = True
+        found.append((members, support))
+    return found

@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import ConvexHull, QhullError
 
 
 class Support(eqx.Module):
@@ -23,6 +23,12 @@ class Support(eqx.Module):
         u = np.cross(self.normal, seed)
         u /= np.linalg.norm(u)
         return np.stack([u, np.cross(self.normal, u), self.normal])  # right-handed
+
+
+def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation by an angle in radians about a unit axis (Rodrigues)."""
+    skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
 
 
 def fit_support(
@@ -84,6 +90,7 @@ def fit_support(
 def convex_footprint(points: Float[np.ndarray, "n 2"], queries: Float[np.ndarray, "m 2"]) -> Bool[np.ndarray, " m"]:
     """Which queries lie within the convex hull of points in the plane."""
     try:
-        return Delaunay(points).find_simplex(queries) >= 0
-    except QhullError:
+        edges = ConvexHull(points).equations
+    except (QhullError, ValueError):  # fewer than three points, or all in a line
         return np.zeros(len(queries), bool)
+    return np.all(queries @ edges[:, :2].T + edges[:, 2] <= 0, axis=1)

@@ -1,0 +1,344 @@
+"""What came in a visit: known templates at new poses, new objects, or ground that was hidden before."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import linear_sum_assignment
+
+from ltgs_jax.detect import dilate
+from ltgs_jax.features import FrontEnd
+from ltgs_jax.fit import Windows, fit_local, template_diameter
+from ltgs_jax.geometry import SE3
+from ltgs_jax.match import Instance
+from ltgs_jax.scene import Template
+from ltgs_jax.template import (
+    Crop,
+    Placement,
+    Support,
+    build_template,
+    explained,
+    make_crop,
+    search_template,
+    settle_template,
+    support_below,
+)
+
+from .config import Config
+from .looks import Evidence, Eye, Observation, compare, cone_of, pad_splats
+from .state import Account, State, add_template, extend_background, next_identity, scene_at, set_from
+
+_FLAT = 0.15  # height over width under which something on bared ground is the ground itself
+
+
+class Arrival(eqx.Module):
+    """Something that came: its volume and outlines, the surface below, windows around it, and whether it may be ground
+    that nobody saw before: much of it was guessed, or something stood there and left."""
+
+    instance: Instance
+    support: Support
+    crop: Crop
+    bared: bool
+
+
+def place_arrivals(
+    state: State,
+    t: int,
+    gone: dict[int, float],
+    instances: Sequence[Instance],
+    observations: Sequence[Observation],
+    evidence: Evidence,
+    bared: Sequence[Bool[np.ndarray, "h w"]],
+    surface: Float[np.ndarray, "n 3"],
+    front_end: FrontEnd,
+    *,
+    eye: Eye,
+    config: Config,
+    rng: np.random.Generator,
+    progress,
+) -> tuple[State, list[Account]]:
+    """Known templates for what came, by photometric evidence and one assignment; new objects for the rest.
+
+    `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground. `surface`:
+    points of the known scene.
+    """
+    arrivals = []
+    cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
+    for instance in instances:
+        support = support_below(instance, surface, np.ones(len(surface)), cameras, rng=rng)
+        if support is None:
+            progress.note(f"visit {t}: a change seen in {instance.views} photographs has no surface below; left out")
+            continue
+        share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
+        share /= max(sum(r.sum() for r in instance.regions), 1)
+        crop = _crop_around(instance, observations, evidence, config)
+        bare = share > 0.4 or _where_something_left(state, t, instance, gone)
+        arrivals.append(Arrival(instance, support, crop, bool(bare)))
+    placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
+    accounts = []
+    pairs = _assigned(len(arrivals), placements, config)
+    wrong = _unexplained(state, t, pairs, placements, observations, evidence, front_end, eye=eye, config=config)
+    for i, k in pairs:
+        if k in wrong:
+            identity = state.chronology.templates[k].identity
+            progress.note(f"visit {t}: arrival {i} is not object {identity}: {wrong[k]:.0%} of it still looks changed")
+            k = None
+        arrival = arrivals[i]
+        if k is not None:
+            placement = placements[i, k]
+            pose, doubt = placement.world_from_template, config.detect.moved
+            state = set_from(state, t, k, visible=True, pose=pose, unsure=doubt)
+            kind = "moved" if k in gone else "added"
+            accounts.append(Account(k, kind, placement.gain, placement.error, arrival.instance.views))
+        else:
+            state, account = _new_object(
+                state, t, arrival, observations, evidence, eye=eye, config=config, rng=rng, progress=progress
+            )
+            accounts += [account] if account is not None else []
+    return state, accounts
+
+
+def turn_in_place(
+    state: State,
+    t: int,
+    gone: dict[int, float],
+    observations: Sequence[Observation],
+    evidence: Evidence,
+    front_end: FrontEnd,
+    *,
+    eye: Eye,
+    config: Config,
+    rng: np.random.Generator,
+    progress,
+) -> tuple[State, list[Account]]:
+    """What seemed to leave and stands where it stood, turned or nudged: looked for there before anything else, since
+    colours that happen to agree leave only pieces of such a change."""
+    accounts = []
+    for k in sorted(gone):
+        support, template = state.supports[k], state.chronology.templates[k]
+        if support is None:
+            continue
+        before = state.chronology.world_from_template[t - 1, k]
+        shown = scene_at(set_from(state, t, k, visible=True, pose=before), t)
+        mine = (shown[2] == k + 1)[:, None].astype(np.float32)
+        cover = [eye.paint(shown[0], o.camera, mine)[..., 0] > 0.5 for o in observations]
+        regions = [dilate(c, 4) & m for c, m in zip(cover, evidence.masks, strict=True)]
+        views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, evidence.masks, strict=True))
+        if views == 0:
+            continue
+        points = np.asarray(before.apply(jnp.asarray(template.splats.means)), np.float64)
+        instance = Instance(points, tuple(regions), views)
+        crop = _crop_around(instance, observations, evidence, config)
+        size = template_diameter(template.splats)
+        search = search_template(
+            template, support, support, np.median(points, axis=0), crop,
+            size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
+        )  # fmt: skip
+        if search.best_gain < 0.5 * config.template.tau_gain:
+            continue
+        found = settle_template(search, crop, size=size, refiner=eye.refiner)
+        if not _convincing(found, config):
+            continue
+        pair, placed = [(0, k)], {(0, k): found}
+        if _unexplained(state, t, pair, placed, observations, evidence, front_end, eye=eye, config=config):
+            continue
+        doubt = config.detect.moved
+        state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=doubt)
+        progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
+        accounts.append(Account(k, "moved", found.gain, found.error, views))
+    return state, accounts
+
+
+def _unexplained(
+    state: State, t: int, pairs, placements, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
+) -> dict[int, float]:
+    """Templates that do not make the change go away where they would stand, with the share of it that remains.
+
+    The test is detection's own: what the template shows there, against what its splats are expected to leave.
+    """
+    trial, doubt = state, config.detect.moved
+    known = [(i, k) for i, k in pairs if k is not None]
+    for i, k in known:
+        trial = set_from(trial, t, k, visible=True, pose=placements[i, k].world_from_template, unsure=doubt)
+    if not known:
+        return {}
+    scene = scene_at(trial, t)
+    after = compare(eye, scene, observations, front_end, config)
+    wrong = {}
+    for _, k in known:
+        mine = (scene[2] == k + 1)[:, None].astype(np.float32)
+        cover = [eye.paint(scene[0], o.camera, mine)[..., 0] > 0.5 for o in observations]
+        was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
+        now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
+        if now > config.template.tau_remains * max(was, 1):
+            wrong[k] = float(now / max(was, 1))
+    return wrong
+
+
+def _convincing(found: Placement, config: Config) -> bool:
+    options = config.template
+    return (
+        found.gain > options.tau_gain and found.overlap > options.tau_outline and found.likeness > options.tau_likeness
+    )
+
+
+def _window(instance: Instance, observations) -> list[tuple[float, float, float]]:
+    """A square around the instance's outline in each photograph; where it has none, around its projected points."""
+    boxes = []
+    for o, region in zip(observations, instance.regions, strict=True):
+        if region.any():
+            rows, columns = np.nonzero(region)
+        else:
+            xy, z = o.camera.project(jnp.asarray(instance.points, jnp.float32))
+            xy = np.asarray(xy)[np.asarray(z) > 1e-3]
+            if len(xy) == 0:
+                xy = np.zeros((1, 2))
+            rows, columns = xy[:, 1], xy[:, 0]
+        top, bottom = np.quantile(rows, [0.0, 1.0])
+        left, right = np.quantile(columns, [0.0, 1.0])
+        side = max(1.6 * max(bottom - top, right - left), 24.0)
+        boxes.append(((left + right - side) / 2, (top + bottom - side) / 2, side))
+    return boxes
+
+
+def _crop_around(instance: Instance, observations, evidence: Evidence, config: Config) -> Crop:
+    regions = [dilate(region, 2) for region in instance.regions]
+    return make_crop(
+        [o.camera for o in observations],
+        [o.image for o in observations],
+        [look.image for look in evidence.looks],
+        [look.depth for look in evidence.looks],
+        # Pixels that other arrivals changed say nothing about this one.
+        [
+            o.valid & (region | ~dilate(mask, 2))
+            for o, region, mask in zip(observations, regions, evidence.masks, strict=True)
+        ],
+        [region & o.valid for o, region in zip(observations, regions, strict=True)],
+        _window(instance, observations),
+        size=config.template.window,
+    )
+
+
+def _placements(
+    state: State, t: int, arrivals: Sequence[Arrival], *, eye: Eye, config: Config, rng, progress
+) -> dict[tuple[int, int], Placement]:
+    """Where each hidden template would stand as each arrival: the best few by a search, then settled."""
+    placements = {}
+    hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
+    sizes = {k: template_diameter(state.chronology.templates[k].splats) for k in hidden}
+    for i, arrival in enumerate(arrivals):
+        searches = {}
+        for k in hidden:
+            stood_on = state.supports[k]
+            if stood_on is None or not _sizes_agree(arrival.instance, sizes[k]):
+                continue
+            searches[k] = search_template(
+                state.chronology.templates[k],
+                stood_on,
+                arrival.support,
+                np.median(arrival.instance.points, axis=0),
+                arrival.crop,
+                size=sizes[k],
+                refiner=eye.refiner,
+                rng=rng,
+                before=state.chronology.world_from_template[t - 1, k],
+                config=config.template,
+            )
+        ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
+        for k in [k for k in ranked if searches[k].best_gain > 0.5 * config.template.tau_gain]:
+            found = settle_template(searches[k], arrival.crop, size=sizes[k], refiner=eye.refiner)
+            placements[i, k] = found
+            identity = state.chronology.templates[k].identity
+            progress.note(
+                f"visit {t}: arrival {i} as object {identity}: explains {found.gain:.2f}, "
+                f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}"
+            )
+    return placements
+
+
+def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:
+    """Each arrival with the template it is, or None for a new object: one assignment, best evidence in total."""
+    good = {
+        pair: found.gain * found.overlap * found.likeness
+        for pair, found in placements.items()
+        if _convincing(found, config)
+    }
+    known = sorted({k for _, k in good})
+    cost = np.zeros((count, len(known) + count))
+    for (i, k), worth in good.items():
+        cost[i, known.index(k)] = -worth
+    pairs = zip(*linear_sum_assignment(cost), strict=True) if count else ()
+    return [(i, known[j] if j < len(known) and cost[i, j] < 0 else None) for i, j in pairs]
+
+
+def _new_object(
+    state: State, t: int, arrival: Arrival, observations, evidence: Evidence, *, eye: Eye, config: Config, rng, progress
+) -> tuple[State, Account | None]:
+    """A template for something never seen before; ground that something had hidden joins the background instead."""
+    cones = [cone_of(o.camera, o.valid, o.valid, look) for o, look in zip(observations, evidence.looks, strict=True)]
+    template = build_template(
+        arrival.instance,
+        arrival.support,
+        cones,
+        [o.image for o in observations],
+        identity=next_identity(state),
+        visit=t,
+        coefficients=state.chronology.background.sh.shape[1],
+        rng=rng,
+        config=config.template,
+    )
+    if template is None:
+        return state, None
+    template, error, gain = _settle_new(template, arrival.crop, eye, config)
+    # More than the change itself: it improves what did not change, and is no account of what did.
+    if not config.template.tau_new <= gain <= 1.3:
+        progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
+        return state, None
+    errors = np.full(template.splats.count, 0.5 * config.detect.guessed, state.errors.dtype)
+    if arrival.bared and _is_flat(template, arrival.support):
+        progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
+        return extend_background(state, template.splats, errors, np.zeros(len(errors), bool)), None
+    state = add_template(state, template, errors, arrival.support, t)
+    return state, Account(len(state.chronology.templates) - 1, "added", gain, error, arrival.instance.views)
+
+
+def _where_something_left(state: State, t: int, instance: Instance, gone) -> bool:
+    """Whether an instance's middle lies within the size of a template from where that stood before it left."""
+    middle = np.median(instance.points, axis=0)
+    for k in gone:
+        means = jnp.asarray(state.chronology.templates[k].splats.means)
+        stood = np.median(np.asarray(state.chronology.world_from_template[t - 1, k].apply(means)), axis=0)
+        if np.linalg.norm(middle - stood) < template_diameter(state.chronology.templates[k].splats):
+            return True
+    return False
+
+
+def _is_flat(template: Template, support: Support) -> bool:
+    means, weight = np.asarray(template.splats.means, np.float64), np.asarray(template.splats.opacities)
+    firm = means[weight > min(0.3, np.quantile(weight, 0.7))]
+    width = np.linalg.norm(np.ptp(firm @ support.frame()[:2].T, axis=0))
+    return bool(np.median(support.height(firm)) < _FLAT * width)
+
+
+def _settle_new(template: Template, crop: Crop, eye: Eye, config: Config) -> tuple[Template, float, float]:
+    """A new object after a short fit in its windows, what is left unlike the photographs, and the share of the change
+    that it explains; splats that the photographs do not support fade and are dropped."""
+    size = template_diameter(template.splats)
+    padded = pad_splats(template.splats, multiple=config.template.new_splats)
+    windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
+    splats, _ = fit_local(padded, windows, size=size, steps=config.template.new_steps)
+    images, _ = eye.refiner.images(splats, SE3.identity((1,), jnp.float32), crop, 0.1 * size)
+    error, gain = explained(images[0], crop)
+    splats = splats[: template.splats.count]
+    keep = np.asarray(splats.opacities) > 0.02
+    if keep.sum() < 8:
+        return template, error, 0.0
+    return eqx.tree_at(lambda m: m.splats, template, splats[keep]), error, gain
+
+
+def _sizes_agree(instance: Instance, size: float) -> bool:
+    """Whether an instance's volume could hold a template: hulls of few views are larger, never much smaller."""
+    low, high = np.quantile(instance.points, [0.02, 0.98], axis=0)
+    return 0.5 * size < np.linalg.norm(high - low) < 6 * size

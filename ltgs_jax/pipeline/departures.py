@@ -1,0 +1,105 @@
+"""What the photographs of a visit say has left its place: hidden, cut out, and the ground under it filled."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ltgs_jax.fit import template_diameter
+from ltgs_jax.scene import Splats, Template, concatenate_splats
+from ltgs_jax.template import Removal, color_from_photographs, fill_under, find_removed, gone_evidence
+
+from .config import Config
+from .looks import Evidence, Eye, Observation, on_host, projection_of
+from .state import State, add_template, cut_background, extend_background, extend_template, next_identity, set_from
+
+
+def take_out(
+    state: State,
+    t: int,
+    gone: dict[int, float],
+    scene: tuple,
+    observations: Sequence[Observation],
+    evidence: Evidence,
+    *,
+    eye: Eye,
+    config: Config,
+    rng: np.random.Generator,
+) -> tuple[State, dict[int, float]]:
+    """Hide the templates and cut out the background objects that the photographs say have left.
+
+    `gone`: what left before in this visit, by template: the share of its evidence that says so; returned with what is
+    new. A remnant of one of these joins it. `scene`: what `scene_at` gave for this state.
+    """
+    splats, _, owner, _ = scene
+    votes = [
+        eye.votes(splats, o.camera, np.stack([o.valid, change.left * o.valid], axis=-1))
+        for o, change in zip(observations, evidence.changes, strict=True)
+    ]
+    seen, told = np.stack([v[:, 0] for v in votes]), np.stack([v[:, 1] for v in votes])
+    pixels = int(np.mean([o.valid.size for o in observations]))
+    gone = dict(gone)
+    for k in range(len(state.chronology.templates)):
+        left, stayed = gone_evidence(seen[:, owner == k + 1], told[:, owner == k + 1])
+        share = left.sum() / max(left.sum() + stayed.sum(), 1e-9)
+        if left.sum() > config.template.min_pixels * pixels and share > config.template.whole:
+            gone[k] = float(share)
+            state = set_from(state, t, k, visible=False)
+    base = owner == 0
+    cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
+    removals = find_removed(
+        splats[base], seen[:, base], told[:, base], cameras, pixels=pixels, rng=rng, config=config.template
+    )
+    return _cut_out(state, t, gone, removals, observations, config)
+
+
+def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observations, config: Config):
+    """Templates of the removals, or more splats for those they were torn from; the ground under them filled."""
+    background, errors = state.chronology.background, state.errors
+    taken = np.zeros(background.count, bool)
+    fills = []
+    for removal in removals:
+        piece = background[removal.members]
+        k = _torn_from(state, piece, gone, t)
+        if k is None:
+            template = Template(piece, next_identity(state), 0)
+            state = add_template(state, template, errors[removal.members], removal.support, 0)
+            k = len(state.chronology.templates) - 1
+            state = set_from(state, t, k, visible=False)
+            gone[k] = removal.share
+        else:
+            state = extend_template(state, k, piece, errors[removal.members])
+        taken |= removal.members
+        if removal.support is not None:
+            fills.append((np.asarray(piece.means, np.float64), removal.support))
+    if not taken.any():
+        return state, gone
+    state = cut_background(state, taken)
+    rest = state.chronology.background
+    new = [on_host(fill_under(rest, points, support, config=config.template)) for points, support in fills]
+    if sum(part.count for part in new):
+        projections = [projection_of(o.camera) for o in observations]
+        ground, seen_there = color_from_photographs(
+            concatenate_splats(new), projections, [o.image for o in observations]
+        )
+        # Its colours are guesses: only a strong difference there says that something came.
+        doubt = np.where(seen_there, 0.5, 1.0) * config.detect.guessed
+        state = extend_background(state, on_host(ground), doubt, np.ones(ground.count, bool))
+    return state, gone
+
+
+def _torn_from(state: State, piece: Splats, gone, t: int) -> int | None:
+    """The template, cut out at this visit, that a smaller piece beside it belongs to."""
+    means = np.asarray(piece.means)
+    for k in gone:
+        template = state.chronology.templates[k]
+        if template.source_visit != 0 or bool(np.asarray(state.chronology.visible)[t:, k].any()):
+            continue
+        pose = state.chronology.world_from_template[t, k]
+        if np.abs(np.asarray(pose.xyz)).max() > 0 or piece.count > template.splats.count:
+            continue
+        size = template_diameter(template.splats)
+        distance = cKDTree(np.asarray(template.splats.means)).query(means)[0]
+        if np.median(distance) < 0.2 * size and np.linalg.norm(np.ptp(means, axis=0)) < size:
+            return k
+    return None

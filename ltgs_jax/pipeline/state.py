@@ -1,0 +1,217 @@
+"""The chronology so far, what the stages know beside it, and how both lie on disk."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ltgs_jax.geometry import SE3
+from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats
+from ltgs_jax.template import Support
+
+from .looks import on_host
+
+
+class State(eqx.Module):
+    """The chronology so far, and what the stages know beside it.
+
+    `errors` expected dissimilarity of each background splat, `template_errors` of each template's; `guessed`
+    background splats that no photograph has shown; `supports` the surface that each template stood on where its frame
+    is.
+    """
+
+    chronology: Chronology
+    errors: Float[np.ndarray, " n"]
+    guessed: Bool[np.ndarray, " n"]
+    template_errors: tuple[Float[np.ndarray, " m"], ...]
+    supports: tuple[Support | None, ...]
+
+    @classmethod
+    def of_initial(cls, splats: Splats, errors: Float[np.ndarray, " n"], visits: tuple[str, ...]) -> "State":
+        """The first visit alone."""
+        return cls(Chronology.of_initial(splats, visits), errors, np.zeros(splats.count, bool), (), ())
+
+
+class Account(eqx.Module):
+    """How one object was explained at one visit: kind, share of the change explained, what is left unlike the
+    photographs, and over how many photographs."""
+
+    template: int = eqx.field(static=True)
+    kind: str = eqx.field(static=True)
+    gain: float = eqx.field(static=True)
+    residual: float = eqx.field(static=True)
+    views: int = eqx.field(static=True)
+
+    def to_json(self) -> dict:
+        """As JSON holds it."""
+        return {
+            "template": self.template,
+            "kind": self.kind,
+            "gain": float(self.gain),
+            "residual": float(self.residual),
+            "views": self.views,
+        }
+
+
+_compose = eqx.filter_jit(compose)  # eagerly, every template's new shape would compile every operation anew
+
+
+def scene_at(
+    state: State, t: int
+) -> tuple[Splats, Float[np.ndarray, " n"], Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The scene at visit t with hidden templates left out: splats, expected errors, owner (0 background, 1 + k), and
+    whether guessed."""
+    splats = on_host(_compose(state.chronology, jnp.asarray(t)))
+    errors = np.concatenate([state.errors, *state.template_errors])
+    counts = [state.chronology.background.count, *[m.splats.count for m in state.chronology.templates]]
+    owner = np.repeat(np.arange(len(counts)), counts)
+    guessed = np.pad(state.guessed, (0, len(owner) - len(state.guessed)))
+    keep = np.asarray(splats.logit_opacities) > -np.inf
+    return splats[keep], errors[keep], owner[keep], guessed[keep]
+
+
+def set_from(state: State, t: int, k: int, *, visible: bool, pose: SE3 | None = None, unsure: float = 0.0) -> State:
+    """Template k from visit t on: whether it is there, and where."""
+    chronology = state.chronology
+    flags = np.array(chronology.visible)
+    flags[t:, k] = visible
+    poses = chronology.world_from_template
+    if pose is not None:
+        # Sides and edges that the first pose never showed: only a strong difference there is a change.
+        state = doubt_template(state, k, np.full(len(state.template_errors[k]), unsure))
+        quat, xyz = np.array(poses.quat), np.array(poses.xyz)
+        quat[t:, k], xyz[t:, k] = np.asarray(pose.quat), np.asarray(pose.xyz)
+        poses = SE3(quat, xyz)
+    chronology = eqx.tree_at(lambda c: (c.visible, c.world_from_template), chronology, (flags, poses))
+    return eqx.tree_at(lambda s: s.chronology, state, chronology)
+
+
+def doubt_template(state: State, k: int, least: Float[np.ndarray, " m"]) -> State:
+    """Template k with at least these errors expected of its splats."""
+    errors = np.maximum(state.template_errors[k], least).astype(np.float32)
+    return eqx.tree_at(lambda s: s.template_errors[k], state, errors)
+
+
+def next_identity(state: State) -> int:
+    """The first that no template has."""
+    return 1 + max([m.identity for m in state.chronology.templates], default=0)
+
+
+def add_template(state: State, template: Template, errors: np.ndarray, support: Support | None, first: int) -> State:
+    """A new template, at its own frame's pose, visible from visit `first` on."""
+    chronology = state.chronology
+    visits = chronology.visible.shape[0]
+    identity = SE3.identity((visits, 1), jnp.float32)
+    poses = jax.tree.map(lambda a, b: np.concatenate([a, b], axis=1), chronology.world_from_template, identity)
+    column = (np.arange(visits) >= first)[:, None]
+    template = eqx.tree_at(lambda m: m.splats, template, on_host(template.splats))
+    return _with_templates(
+        state,
+        (*chronology.templates, template),
+        poses,
+        np.concatenate([chronology.visible, column], axis=1),
+        (*state.template_errors, errors),
+        (*state.supports, support),
+    )
+
+
+def drop_template(state: State, k: int) -> State:
+    """The state without template k; those after it move up by one."""
+    chronology = state.chronology
+    keep = [i for i in range(len(chronology.templates)) if i != k]
+    return _with_templates(
+        state,
+        tuple(chronology.templates[i] for i in keep),
+        jax.tree.map(lambda leaf: np.asarray(leaf)[:, keep], chronology.world_from_template),
+        np.asarray(chronology.visible)[:, keep],
+        tuple(state.template_errors[i] for i in keep),
+        tuple(state.supports[i] for i in keep),
+    )
+
+
+def _with_templates(state: State, templates, poses: SE3, visible, errors, supports) -> State:
+    old = state.chronology
+    chronology = Chronology(old.background, templates, poses, visible, old.exposure, old.visits, old.photographs)
+    return State(chronology, state.errors, state.guessed, errors, supports)
+
+
+def extend_template(state: State, k: int, splats: Splats, errors: np.ndarray) -> State:
+    """More splats, in world coordinates, for a template whose frame is the world's."""
+    joined = concatenate_splats([state.chronology.templates[k].splats, splats])
+    return eqx.tree_at(
+        lambda s: (s.chronology.templates[k].splats, s.template_errors[k]),
+        state,
+        (on_host(joined), np.concatenate([state.template_errors[k], errors])),
+    )
+
+
+def extend_background(state: State, splats: Splats, errors: np.ndarray, guessed: np.ndarray) -> State:
+    """More splats behind everything, at every visit."""
+    return eqx.tree_at(
+        lambda s: (s.chronology.background, s.errors, s.guessed),
+        state,
+        (
+            on_host(concatenate_splats([state.chronology.background, splats])),
+            np.concatenate([state.errors, errors.astype(state.errors.dtype)]),
+            np.concatenate([state.guessed, guessed]),
+        ),
+    )
+
+
+def cut_background(state: State, taken: Bool[np.ndarray, " n"]) -> State:
+    """The background without some of its splats."""
+    return eqx.tree_at(
+        lambda s: (s.chronology.background, s.errors, s.guessed),
+        state,
+        (state.chronology.background[~taken], state.errors[~taken], state.guessed[~taken]),
+    )
+
+
+_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+
+
+def pack_splats(prefix: str, splats: Splats) -> dict[str, np.ndarray]:
+    """Arrays by name."""
+    return {f"{prefix}{field}": np.asarray(getattr(splats, field)) for field in _FIELDS}
+
+
+def unpack_splats(prefix: str, arrays: dict[str, np.ndarray]) -> Splats:
+    """The splats that `pack_splats` named."""
+    return Splats(**{field: arrays[f"{prefix}{field}"] for field in _FIELDS})
+
+
+def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
+    """A state as arrays by name, and what JSON holds of it."""
+    chronology = state.chronology
+    arrays = {
+        **pack_splats("background.", chronology.background),
+        "errors": state.errors,
+        "guessed": state.guessed,
+        "quat": np.asarray(chronology.world_from_template.quat),
+        "xyz": np.asarray(chronology.world_from_template.xyz),
+        "visible": np.asarray(chronology.visible),
+    }
+    for k, template in enumerate(chronology.templates):
+        arrays |= pack_splats(f"template{k}.", template.splats)
+        arrays[f"template{k}.errors"] = state.template_errors[k]
+        support = state.supports[k]
+        if support is not None:
+            arrays[f"template{k}.support"] = np.asarray([*support.normal, support.offset, support.noise])
+    return arrays, {"templates": [[m.identity, m.source_visit] for m in chronology.templates]}
+
+
+def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, ...]) -> State:
+    """The state that `pack_state` named."""
+    templates, errors, supports = [], [], []
+    for k, (identity, source) in enumerate(notes["templates"]):
+        templates.append(Template(unpack_splats(f"template{k}.", arrays), identity, source))
+        errors.append(arrays[f"template{k}.errors"])
+        packed = arrays.get(f"template{k}.support")
+        supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
+    start = State.of_initial(unpack_splats("background.", arrays), arrays["errors"], visits)
+    start = eqx.tree_at(lambda s: s.guessed, start, arrays["guessed"])
+    poses = SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"]))
+    return _with_templates(
+        start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)
+    )
