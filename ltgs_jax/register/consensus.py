@@ -5,7 +5,6 @@ import functools
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_batching import sequential_vmap
 from jax.lax import Precision
 from jaxtyping import Array, Float, PRNGKeyArray
@@ -97,9 +96,8 @@ def _attempt(problem: Problem, key: PRNGKeyArray, effort: Effort, config: Regist
     null = jnp.maximum(jnp.max(scores[1], axis=1), _LEAST_NULL * vote(problem))
     above = distinction(scores[0], null[:, None], vote(problem))
     motions = found[0]
-    # The caller had a reason for the given bound; at bounds that were not searched, scores do but tell motions apart.
-    handicap = np.where(np.isin(_COMPARED, effort.bound_factors), _CHANGE, np.inf)
-    handicap = jnp.asarray(np.where(np.equal(_COMPARED, 1), 0, handicap), problem.src.dtype)[:, None]
+    # The caller had a reason for the given bound.
+    handicap = jnp.full(len(_COMPARED), _CHANGE).at[0].set(0)[:, None]
     heard = jnp.max(above, axis=1, keepdims=True)
     standing = jnp.max(above - handicap, axis=0)
     # Which of two motions it is, all bounds say at which anything stands out; where it is, the exact pairs.

@@ -15,14 +15,9 @@ from .refine import BOUND_IN_SIGMA, probability_within
 LEVELS = (1.0, 0.5, 0.25)
 # Window of the comparison, in units of the given bound: beyond it every level sees outliers alone.
 _WINDOW = 2.0
-# Nats by which a narrower level must beat the given one, which the caller had a reason for: with the right bound, a
-# half reached 4 and a quarter −4 at most over 84 problems.
-_TRUST = 2.0
-# Radii of the discs of outliers, in windows, and the log density outside of them.
-_DISCS = (1.0, 0.75, 0.5)
-_NEVER = -60.0
-_EM_STEPS = 24
-_LEAST_SHARE = 1e-3
+# Nats by which a narrower level must beat the given one, which the caller had a reason for.
+_TRUST = 6.0
+_EM_STEPS = 10
 
 
 def _log_gaussian_norm(r: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[Array, " n"]:
@@ -34,36 +29,31 @@ def _log_gaussian_norm(r: Float[Array, " n"], sigma: Float[Array, ""]) -> Float[
 def log_evidence(
     norms: Float[Array, " n"], weights: Float[Array, " n"], sigma: Float[Array, ""], window: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """Log evidence of a core of noise σ in residual norms within a window.
+    """Log evidence of noise σ in residual norms within a window, among outliers spread evenly over a surface.
 
-    What is not of the core is spread evenly over discs of a surface (near misses end somewhere):
-    Σ w·log(p·χ₃(r/σ) + Σₖ qₖ·2r/dₖ²) at its best shares, and 6·log σ for the room of the six fitted parameters
+    Σ w·log(p·χ₃(r/σ) + (1 − p)·2r/window²) at its best share p, and 6·log σ for the room of the six fitted parameters
     (Laplace). `weights` 0 outside the window.
     """
     r = jnp.clip(norms, jnp.finfo(norms.dtype).eps * window, window)
-    radii = window * jnp.asarray(_DISCS, norms.dtype)[:, None]
-    discs = jnp.where(r <= radii, jnp.log(2 * r) - 2 * jnp.log(radii), _NEVER)
-    logs = jnp.concatenate([_log_gaussian_norm(r, sigma)[None], discs])
+    inlier, outlier = _log_gaussian_norm(r, sigma), jnp.log(2 * r) - 2 * jnp.log(window)
     total = jnp.maximum(jnp.sum(weights), jnp.finfo(norms.dtype).tiny)
 
-    def mixture(shares):
-        return jax.nn.logsumexp(jnp.log(shares)[:, None] + logs, axis=0)
+    def mixture(share):
+        return jnp.logaddexp(jnp.log(share) + inlier, jnp.log1p(-share) + outlier)
 
-    def step(_, shares):
-        posterior = jnp.exp(jnp.log(shares)[:, None] + logs - mixture(shares))
-        shares = jnp.maximum(jnp.sum(weights * posterior, axis=1) / total, _LEAST_SHARE)
-        return shares / jnp.sum(shares)
+    def step(_, share):
+        posterior = jnp.exp(jnp.log(share) + inlier - mixture(share))
+        return jnp.clip(jnp.sum(weights * posterior) / total, 0.01, 0.99)
 
-    start = jnp.full(logs.shape[0], 1 / logs.shape[0], norms.dtype)
-    shares = jax.lax.fori_loop(0, _EM_STEPS, step, start)
-    return jnp.sum(weights * mixture(shares)) + 6 * jnp.log(sigma)
+    share = jax.lax.fori_loop(0, _EM_STEPS, step, jnp.asarray(0.5, norms.dtype))
+    return jnp.sum(weights * mixture(share)) + 6 * jnp.log(sigma)
 
 
 def narrow_bound(versions: SE3, problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
     """The motion, and the noise bound that the residuals speak for: the given one, a half or a quarter.
 
-    `versions` [3] the best at each. A bound that is too wide lets near misses in, unless a core of exact pairs stands
-    out; one that is too narrow is not widened, since near misses would look the same.
+    `versions` [3] the best at each. A bound that is too wide lets near misses in; one that is too narrow is not
+    widened, since near misses would look the same.
     """
     moments = alignment_moments(problem.src, problem.dst)
     factors = jnp.asarray(LEVELS, problem.src.dtype)
@@ -76,7 +66,6 @@ def narrow_bound(versions: SE3, problem: Problem, config: RegisterConfig) -> tup
     norms = jnp.sqrt(squared_residuals(motions.rotmat(), motions.xyz, problem.src, problem.dst))
     window = _WINDOW * problem.bound
     seen = jnp.where(norms[0] < window, problem.weights, 0)
-    sigmas = bounds / BOUND_IN_SIGMA
-    evidence = jax.vmap(lambda r, sigma: log_evidence(r, seen, sigma, window))(norms, sigmas)
+    evidence = jax.vmap(lambda r, bound: log_evidence(r, seen, bound / BOUND_IN_SIGMA, window))(norms, bounds)
     best = jnp.argmax(evidence.at[0].add(_TRUST))
     return motions[best], bounds[best]
