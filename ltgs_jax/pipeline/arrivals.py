@@ -122,8 +122,7 @@ def turn_in_place(
             continue
         before = state.chronology.world_from_template[t - 1, k]
         shown = scene_at(set_from(state, t, k, visible=True, pose=before), t)
-        mine = (shown[2] == k + 1)[:, None].astype(np.float32)
-        cover = [eye.paint(shown[0], o.camera, mine)[..., 0] > 0.5 for o in observations]
+        cover = _cover(eye, shown, k, observations)
         regions = [dilate(c, 4) & m for c, m in zip(cover, evidence.masks, strict=True)]
         views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, evidence.masks, strict=True))
         if views == 0:
@@ -168,13 +167,19 @@ def _unexplained(
     after = compare(eye, scene, observations, front_end, config)
     wrong = {}
     for _, k in known:
-        mine = (scene[2] == k + 1)[:, None].astype(np.float32)
-        cover = [eye.paint(scene[0], o.camera, mine)[..., 0] > 0.5 for o in observations]
+        cover = _cover(eye, scene, k, observations)
         was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
         now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
         if now > config.template.tau_remains * max(was, 1):
             wrong[k] = float(now / max(was, 1))
     return wrong
+
+
+def _cover(eye: Eye, scene: tuple, k: int, observations: Sequence[Observation]) -> list[Bool[np.ndarray, "h w"]]:
+    """The pixels of each photograph in which a scene (`scene_at`) shows mostly template k."""
+    splats, _, owner, _ = scene
+    mine = (owner == k + 1)[:, None].astype(np.float32)
+    return [eye.paint(splats, o.camera, mine)[..., 0] > 0.5 for o in observations]
 
 
 def _convincing(found: Placement, config: Config) -> bool:
