@@ -225,6 +225,9 @@ def template_diameter(splats: Splats) -> float:
 
 def _plan(chronology: Chronology, views: Sequence[VisitView], size: tuple[int, int]) -> RenderPlan:
     """A plan with room for every photograph of one size."""
-    return plan_for(
-        [(compose(chronology, v.visit), v.view.camera) for v in views if size_of(v.view) == size], slack=1.4
-    )
+    chosen = [v for v in views if size_of(v.view) == size]
+    scenes = {t: _composed(chronology, jnp.asarray(t)) for t in {v.visit for v in chosen}}
+    return plan_for([(scenes[v.visit], v.view.camera) for v in chosen], slack=1.4)
+
+
+_composed = eqx.filter_jit(compose)

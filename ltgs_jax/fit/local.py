@@ -37,30 +37,34 @@ def _step(splats: Splats, state, windows: Windows, size, progress, plan: RenderP
         needles = jnp.mean(jax.nn.relu(jnp.ptp(splats.log_scales, axis=-1) - jnp.log(5.0)))
         large = jnp.mean(jax.nn.relu(jnp.max(splats.scales, axis=-1) / size - 0.1))
         loss = jnp.sum(error) / jnp.maximum(3 * jnp.sum(windows.valid), 1)
-        return loss + 0.01 * needles + 0.1 * large + 1e-3 * jnp.mean(splats.opacities), (loss, out.overflow)
+        return loss + 0.01 * needles + 0.1 * large + 1e-3 * jnp.mean(splats.opacities), (loss, image, out.overflow)
 
-    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(splats)
+    gradient, (loss, image, overflow) = jax.grad(objective, has_aux=True)(splats)
     updates, state = adam().update(gradient, state)
-    return eqx.apply_updates(splats, scale_gradients(updates, _RATES, size, progress)), state, loss, overflow
+    return eqx.apply_updates(splats, scale_gradients(updates, _RATES, size, progress)), state, loss, image, overflow
 
 
-def fit_local(splats: Splats, windows: Windows, *, size: float, steps: int) -> tuple[Splats, Float[np.ndarray, " s"]]:
+def fit_local(
+    splats: Splats, windows: Windows, *, size: float, steps: int
+) -> tuple[Splats, Float[np.ndarray, " s"], Float[np.ndarray, "v s s 3"]]:
     """Fit an object's splats to windows of photographs by L1, with priors against needles and oversized splats.
 
     `size` is the object's diameter in scene units. View-dependent colour is left alone: few views cannot tell it.
-    Returns the splats and the loss of every step. A step that is not finite ends the fit with the state before it.
+    Returns the splats, the loss of every step, and the windows as the last step saw them. A step that is not finite
+    ends the fit with the state before it.
     """
     state = adam().init(splats)
-    plan = plan_render(splats, windows.cameras, slack=1.6)
+    plan = plan_render(splats, windows.cameras, slack=3)  # roomy: one compilation serves many objects
+    images = np.asarray(windows.backdrop)
     losses = np.zeros(steps, np.float32)
     scale = jnp.asarray(size, splats.means.dtype)
     for step in range(steps):
         progress = jnp.asarray(step / steps, splats.means.dtype)
-        moved, state, loss, overflow = _step(splats, state, windows, scale, progress, plan)
+        moved, state, loss, image, overflow = _step(splats, state, windows, scale, progress, plan)
         losses[step] = loss
         if not np.isfinite(losses[step]):
-            return splats, losses[:step]
-        splats = moved
+            return splats, losses[:step], np.asarray(images)
+        splats, images = moved, image
         if int(overflow) > 0:
-            plan = plan_render(splats, windows.cameras, slack=1.6)
-    return splats, losses
+            plan = plan_render(splats, windows.cameras, slack=3)
+    return splats, losses, np.asarray(images)

@@ -13,3 +13,4 @@ from .sh import eval_sh as eval_sh
 from .sh import rotate_sh as rotate_sh
 from .sh import sh_basis as sh_basis
 from .sh import sh_degree as sh_degree
+from .sh import sh_rotations as sh_rotations

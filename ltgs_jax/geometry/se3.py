@@ -24,6 +24,7 @@ def normalize_quats(quats: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     return scaled / _safe_norm(scaled)
 
 
+@jax.jit
 def rotmat_from_quat(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Rotation matrices of wxyz quaternions, which need not be unit."""
     w, x, y, z = jnp.moveaxis(normalize_quats(quats), -1, 0)
@@ -35,6 +36,7 @@ def rotmat_from_quat(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     return jnp.stack(rows, axis=-2)
 
 
+@jax.jit
 def quat_from_rotmat(rotmat: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
     """wxyz quaternions of rotation matrices, by the best conditioned of the four branches (Shepperd 1978)."""
     m = [[rotmat[..., i, j] for j in range(3)] for i in range(3)]
@@ -64,6 +66,7 @@ def quat_from_rotmat(rotmat: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
     return normalize_quats(quat)
 
 
+@jax.jit
 def multiply_quats(a: Float[Array, "... 4"], b: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     """Hamilton product a·b."""
     aw, ax, ay, az = jnp.moveaxis(a, -1, 0)
@@ -105,6 +108,7 @@ class SE3(eqx.Module):
         return SE3(quat_from_rotmat(matrix[..., :3, :3]), matrix[..., :3, 3])
 
     @staticmethod
+    @jax.jit
     def exp(tangent: Float[Array, "... 6"]) -> "SE3":
         """Exponential of (v, ω), translation first; smooth, derivatives included, at ω = 0."""
         v, omega = tangent[..., :3], tangent[..., 3:]

@@ -76,19 +76,27 @@ def _samples(degree: int) -> tuple[np.ndarray, np.ndarray]:
     return directions, np.linalg.pinv(np.stack(_band_values(*directions.T, degree), axis=-1))
 
 
-def rotate_sh(sh: Float[Array, "... k 3"], rotmat: Float[Array, "3 3"]) -> Float[Array, "... k 3"]:
-    """Coefficients of the rotated function f'(d) = f(Rᵀd), band by band (equation 1 of the LTGS paper).
+def sh_rotations(rotmat: Float[Array, "*b 3 3"], degree: int) -> tuple[Float[Array, "*b m m"], ...]:
+    """How a rotation turns the coefficients of each band from 1 to `degree`, m = 2·band + 1.
 
     A band is closed under rotation, so its matrix is the pseudo-inverse of the band at fixed directions times the band
     at the directions turned back: exact to rounding, differentiable in `rotmat`, free of recursions.
     """
-    degree = sh_degree(sh)
-    bands = [sh[..., :1, :]]
+    matrices = []
     for band in range(1, degree + 1):
         directions, inverse = _samples(band)
-        turned = jnp.matmul(jnp.asarray(directions, sh.dtype), rotmat.astype(sh.dtype), precision=Precision.HIGHEST)
-        values = sh_basis(turned, band)[:, band**2 :]
-        matrix = jnp.matmul(jnp.asarray(inverse, sh.dtype), values, precision=Precision.HIGHEST)
+        turned = jnp.matmul(jnp.asarray(directions, rotmat.dtype), rotmat, precision=Precision.HIGHEST)
+        values = sh_basis(turned, band)[..., band**2 :]
+        matrices.append(jnp.matmul(jnp.asarray(inverse, rotmat.dtype), values, precision=Precision.HIGHEST))
+    return tuple(matrices)
+
+
+def rotate_sh(sh: Float[Array, "*b k 3"], rotations: tuple[Float[Array, "*#b m m"], ...]) -> Float[Array, "*b k 3"]:
+    """Coefficients of the rotated function f'(d) = f(Rᵀd), band by band, by `sh_rotations` (equation 1 of the LTGS
+    paper)."""
+    bands = [sh[..., :1, :]]
+    for band, matrix in enumerate(rotations, start=1):
         coefficients = sh[..., band**2 : (band + 1) ** 2, :]
-        bands.append(jnp.einsum("ij,...jc->...ic", matrix, coefficients, precision=Precision.HIGHEST))
+        # A sum of products: as a batch of small products of matrices XLA's CPU backend is slower.
+        bands.append(jnp.sum(matrix[..., None] * coefficients[..., None, :, :], axis=-2))
     return jnp.concatenate(bands, axis=-2)

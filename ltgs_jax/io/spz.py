@@ -8,7 +8,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from ltgs_jax.geometry import rotate_sh, sh_degree
+from ltgs_jax.geometry import rotate_sh, sh_degree, sh_rotations
 from ltgs_jax.scene import Splats
 
 from .files import InputError, read_bytes, write_bytes
@@ -53,7 +53,8 @@ def read_spz(path: str | Path) -> Splats:
 
 
 def _with_turned_sh(splats: Splats) -> Splats:
-    sh = rotate_sh(splats.sh, jnp.asarray(_HALF_TURN, splats.sh.dtype)) if splats.sh.shape[1] > 1 else splats.sh
+    turn = sh_rotations(jnp.asarray(_HALF_TURN, splats.sh.dtype), sh_degree(splats.sh))
+    sh = rotate_sh(splats.sh, turn)
     return Splats(splats.means, splats.quats, splats.log_scales, splats.logit_opacities, sh)
 
 

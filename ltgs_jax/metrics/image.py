@@ -46,6 +46,11 @@ def ssim(
     size = 2 * SSIM_RADIUS + 1
     if min(image.shape[-3:-1]) < size:
         raise ValueError(f"image: expected at least {size} × {size} pixels, got {image.shape[-3:-1]}")
+    return _mean_ssim(image, target, mask)
+
+
+@jax.jit
+def _mean_ssim(image: Array, target: Array, mask: Array | None) -> Array:
     similarity = _flat(ssim_map(image, target))
     if mask is None:
         return _mean_inside(similarity, image.shape[-1])

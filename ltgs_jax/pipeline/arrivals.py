@@ -11,7 +11,6 @@ from scipy.optimize import linear_sum_assignment
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
-from ltgs_jax.geometry import SE3
 from ltgs_jax.match import Instance
 from ltgs_jax.scene import Template
 from ltgs_jax.template import (
@@ -30,6 +29,7 @@ from .config import Config
 from .looks import Evidence, Eye, Observation, compare, cone_of, pad_splats
 from .state import Account, State, add_template, extend_background, next_identity, scene_at, set_from
 
+_BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _FLAT = 0.15  # height over width under which something on bared ground is the ground itself
 
 
@@ -61,7 +61,8 @@ def place_arrivals(
 ) -> tuple[State, list[Account]]:
     """Known templates for what came, by photometric evidence and one assignment; new objects for the rest.
 
-    `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground. `surface`:
+    `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground, or
+    did show what left. `surface`:
     points of the known scene.
     """
     arrivals = []
@@ -73,9 +74,9 @@ def place_arrivals(
             continue
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
+        print("SHARE",round(float(share),2))
         crop = _crop_around(instance, observations, evidence, config)
-        bare = share > 0.4 or _where_something_left(state, t, instance, gone)
-        arrivals.append(Arrival(instance, support, crop, bool(bare)))
+        arrivals.append(Arrival(instance, support, crop, bool(share > _BARED)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
     accounts = []
     pairs = _assigned(len(arrivals), placements, config)
@@ -122,7 +123,7 @@ def turn_in_place(
             continue
         before = state.chronology.world_from_template[t - 1, k]
         shown = scene_at(set_from(state, t, k, visible=True, pose=before), t)
-        cover = _cover(eye, shown, k, observations)
+        cover = eye.cover(shown, [k], observations)
         regions = [dilate(c, 4) & m for c, m in zip(cover, evidence.masks, strict=True)]
         views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, evidence.masks, strict=True))
         if views == 0:
@@ -167,19 +168,12 @@ def _unexplained(
     after = compare(eye, scene, observations, front_end, config)
     wrong = {}
     for _, k in known:
-        cover = _cover(eye, scene, k, observations)
+        cover = eye.cover(scene, [k], observations)
         was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
         now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
         if now > config.template.tau_remains * max(was, 1):
             wrong[k] = float(now / max(was, 1))
     return wrong
-
-
-def _cover(eye: Eye, scene: tuple, k: int, observations: Sequence[Observation]) -> list[Bool[np.ndarray, "h w"]]:
-    """The pixels of each photograph in which a scene (`scene_at`) shows mostly template k."""
-    splats, _, owner, _ = scene
-    mine = (owner == k + 1)[:, None].astype(np.float32)
-    return [eye.paint(splats, o.camera, mine)[..., 0] > 0.5 for o in observations]
 
 
 def _convincing(found: Placement, config: Config) -> bool:
@@ -296,7 +290,7 @@ def _new_object(
     )
     if template is None:
         return state, None
-    template, error, gain = _settle_new(template, arrival.crop, eye, config)
+    template, error, gain = _settle_new(template, arrival.crop, config)
     # More than the change itself: it improves what did not change, and is no account of what did.
     if not config.template.tau_new <= gain <= 1.3:
         progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
@@ -309,17 +303,6 @@ def _new_object(
     return state, Account(len(state.chronology.templates) - 1, "added", gain, error, arrival.instance.views)
 
 
-def _where_something_left(state: State, t: int, instance: Instance, gone) -> bool:
-    """Whether an instance's middle lies within the size of a template from where that stood before it left."""
-    middle = np.median(instance.points, axis=0)
-    for k in gone:
-        means = jnp.asarray(state.chronology.templates[k].splats.means)
-        stood = np.median(np.asarray(state.chronology.world_from_template[t - 1, k].apply(means)), axis=0)
-        if np.linalg.norm(middle - stood) < template_diameter(state.chronology.templates[k].splats):
-            return True
-    return False
-
-
 def _is_flat(template: Template, support: Support) -> bool:
     means, weight = np.asarray(template.splats.means, np.float64), np.asarray(template.splats.opacities)
     firm = means[weight > min(0.3, np.quantile(weight, 0.7))]
@@ -327,15 +310,14 @@ def _is_flat(template: Template, support: Support) -> bool:
     return bool(np.median(support.height(firm)) < _FLAT * width)
 
 
-def _settle_new(template: Template, crop: Crop, eye: Eye, config: Config) -> tuple[Template, float, float]:
+def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:
     """A new object after a short fit in its windows, what is left unlike the photographs, and the share of the change
     that it explains; splats that the photographs do not support fade and are dropped."""
     size = template_diameter(template.splats)
     padded = pad_splats(template.splats, multiple=config.template.new_splats)
     windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
-    splats, _ = fit_local(padded, windows, size=size, steps=config.template.new_steps)
-    images, _ = eye.refiner.images(splats, SE3.identity((1,), jnp.float32), crop, 0.1 * size)
-    error, gain = explained(images[0], crop)
+    splats, _, images = fit_local(padded, windows, size=size, steps=config.template.new_steps)
+    error, gain = explained(images, crop)
     splats = splats[: template.splats.count]
     keep = np.asarray(splats.opacities) > 0.02
     if keep.sum() < 8:

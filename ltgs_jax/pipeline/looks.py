@@ -114,6 +114,14 @@ class Eye:
         values = np.pad(np.asarray(values, np.float32), ((0, padded.count - splats.count), (0, 0)))
         return np.asarray(_render_values(padded, camera, values, self._plan(padded, camera))[0])
 
+    def cover(
+        self, scene: tuple, templates: Sequence[int], observations: Sequence[Observation]
+    ) -> list[Bool[np.ndarray, "h w"]]:
+        """The pixels of each photograph in which a scene (`scene_at`) shows mostly these templates."""
+        splats, _, owner, _ = scene
+        mine = np.isin(owner, np.asarray(templates, int) + 1)[:, None].astype(np.float32)
+        return [self.paint(splats, o.camera, mine)[..., 0] > 0.5 for o in observations]
+
     def votes(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "n m"]:
         """Σ αT·value per splat."""
         padded = pad_splats(splats)

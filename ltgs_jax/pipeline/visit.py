@@ -63,7 +63,9 @@ def explain_visit(
     ]
     splats, _, _, guessed = scene
     surface = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.3]
-    bared = [eye.paint(splats, o.camera, guessed[:, None])[..., 0] > 0.5 for o in observations]
+    guesses = [eye.paint(splats, o.camera, guessed[:, None])[..., 0] > 0.5 for o in observations]
+    stood = eye.cover(scene_at(state, t - 1), sorted(gone), observations)
+    bared = [dilate(s, config.detect.dilate) | g for s, g in zip(stood, guesses, strict=True)]
     instances = [
         instance
         for instance in find_instances(cones, surface, config=config.match)

@@ -20,17 +20,22 @@ from .slots import block_rounds, tiles_per_block
 _made: dict[tuple, set[RenderPlan]] = {}
 
 
-def _settle(kind: tuple, pairs: float, rounds: float) -> RenderPlan:
-    """A plan with room for so many pairs and rounds: the smallest made before that fits without waste, or a new one."""
+def _settle(kind: tuple, pairs: int, rounds: int, slack: float) -> RenderPlan:
+    """A plan with room for so many pairs and rounds: the smallest made before that fits without waste, or a new one.
+
+    One made before need not have all of `slack` to spare.
+    """
     plans = _made.setdefault(kind, set())
+    least, most = min(slack, 1.2), 2 * slack
     fits = [
         plan
         for plan in plans
-        if pairs <= plan.intersections <= 2 * max(pairs, 1024) and rounds <= plan.rounds <= 2 * max(rounds, 16)
+        if least * pairs <= plan.intersections <= most * max(pairs, 1024)
+        and least * rounds <= plan.rounds <= most * max(rounds, 16)
     ]
     if fits:
         return min(fits, key=lambda plan: (plan.intersections, plan.rounds))
-    plan = RenderPlan(_round_up(pairs, 1024), _round_up(rounds, 16))
+    plan = RenderPlan(_round_up(slack * pairs, 1024), _round_up(slack * rounds, 16))
     plans.add(plan)
     return plan
 
@@ -105,4 +110,4 @@ def plan_render(
     kind = (splats.count, cameras.K.shape[0], cameras.width, cameras.height, config, tiles is None or tiles.shape)
     batch_tiles = tiles if tiles is None or camera.K.ndim == 3 else tiles[None]
     pairs, rounds = _count(splats, cameras, batch_tiles, config=config)
-    return _settle(kind, int(pairs) * slack, int(rounds) * slack)
+    return _settle(kind, int(pairs), int(rounds), slack)

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
@@ -62,12 +63,14 @@ def compose(chronology: Chronology, t: int | Int[Array, ""]) -> Splats:
     visits = chronology.visible.shape[0]
     if isinstance(t, int) and not 0 <= t < visits:
         raise ValueError(f"t: expected a visit from 0 to {visits - 1}, got {t}")
-    parts = [chronology.background]
-    for k, template in enumerate(chronology.templates):
-        moved = transform_splats(chronology.world_from_template[t, k], template.splats)
-        logits = jnp.where(chronology.visible[t, k], moved.logit_opacities, -jnp.inf)
-        parts.append(eqx.tree_at(lambda s: s.logit_opacities, moved, logits))
-    return concatenate_splats(parts)
+    if not chronology.templates:
+        return chronology.background
+    # All templates at once: what there is to compile does not grow with their number.
+    splats = concatenate_splats([template.splats for template in chronology.templates])
+    owner = np.repeat(np.arange(len(chronology.templates)), [m.splats.count for m in chronology.templates])
+    moved = transform_splats(chronology.world_from_template[t], splats, owner)
+    logits = jnp.where(chronology.visible[t][owner], moved.logit_opacities, -jnp.inf)
+    return concatenate_splats([chronology.background, eqx.tree_at(lambda s: s.logit_opacities, moved, logits)])
 
 
 def drop_hidden(splats: Splats) -> Splats:

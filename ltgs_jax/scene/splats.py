@@ -4,10 +4,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.lax import Precision
 from jaxtyping import Array, Bool, Float, Int
 
-from ltgs_jax.geometry import SE3, multiply_quats, rotate_sh
+from ltgs_jax.geometry import SE3, multiply_quats, rotate_sh, sh_degree, sh_rotations
 
 
 class Splats(eqx.Module):
@@ -58,14 +57,21 @@ def concatenate_splats(parts: list[Splats]) -> Splats:
     return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *padded)
 
 
-def transform_splats(b_from_a: SE3, splats: Splats) -> Splats:
-    """Move splats rigidly: means, orientations and spherical harmonics (equation 1 of the LTGS paper)."""
+def transform_splats(b_from_a: SE3, splats: Splats, owner: Int[Array, " n"] | None = None) -> Splats:
+    """Move splats rigidly: means, orientations and spherical harmonics (equation 1 of the LTGS paper).
+
+    With `owner`, `b_from_a` is a batch of motions, and splat i moves by that of `owner[i]`.
+    """
     rotmat = b_from_a.rotmat().astype(splats.means.dtype)
-    means = jnp.einsum("ij,nj->ni", rotmat, splats.means, precision=Precision.HIGHEST) + b_from_a.xyz
+    rotations = sh_rotations(rotmat, sh_degree(splats.sh))
+
+    def own(leaf):
+        return leaf[None] if owner is None else leaf[owner]
+
     return Splats(
-        means=means,
-        quats=multiply_quats(b_from_a.quat[None], splats.quats),
+        means=jnp.sum(own(rotmat) * splats.means[:, None, :], axis=-1) + own(b_from_a.xyz),
+        quats=multiply_quats(own(b_from_a.quat), splats.quats),
         log_scales=splats.log_scales,
         logit_opacities=splats.logit_opacities,
-        sh=rotate_sh(splats.sh, rotmat),
+        sh=rotate_sh(splats.sh, tuple(own(matrix) for matrix in rotations)),
     )

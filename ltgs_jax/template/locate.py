@@ -122,7 +122,7 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
     return Camera(tile.cam_from_world @ spread, tile.K, cameras.width, cameras.height)
 
 
-_BATCH = 64  # poses rendered in one call of a search
+_FEW, _BATCH = 14, 64  # poses rendered in one call: of a descent (two with their probes), of a search
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 
 
@@ -243,6 +243,8 @@ class Refiner:
         self, template: Splats, poses: SE3, crop: Crop, tolerance: float
     ) -> tuple[Float[np.ndarray, "m v s s 3"], Float[np.ndarray, "m v s s"]]:
         """Composites at every pose, and the template's visible alpha."""
+        count = poses.xyz.shape[0]
+        poses = poses[np.minimum(np.arange(next(b for b in (_FEW, _BATCH) if b >= count)), count - 1)]
         key = (template.count, poses.xyz.shape[0], *crop.depth.shape)
         plan = self._plans.get(key)
         if plan is None:
@@ -251,7 +253,7 @@ class Refiner:
             images, cover, overflow = _composites(template, poses, crop, jnp.asarray(tolerance, jnp.float32), plan)
             if int(overflow) == 0:
                 self._plans[key] = plan
-                return np.asarray(images), np.asarray(cover)
+                return np.asarray(images)[:count], np.asarray(cover)[:count]
             needed = plan_render(template, posed(crop.camera, poses), slack=1.5)
             plan = RenderPlan(
                 max(plan.intersections, needed.intersections) * 3 // 2, max(plan.rounds, needed.rounds) * 3 // 2
@@ -262,10 +264,9 @@ class Refiner:
         m = poses.xyz.shape[0]
         errors = []
         for start in range(0, m, _BATCH):
-            index = np.minimum(np.arange(start, start + _BATCH), m - 1)
-            images, _ = self.images(template, poses[index], crop, tolerance)
+            images, _ = self.images(template, poses[start : start + _BATCH], crop, tolerance)
             errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
-        return np.concatenate(errors)[:m]
+        return np.concatenate(errors)
 
     def slide(
         self,
