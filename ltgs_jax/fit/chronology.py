@@ -217,9 +217,14 @@ def fit_chronology(
     return _assemble(variables, chronology, placements), losses
 
 
+_SHOWN = -2.2  # logit of the opacity from which on a splat counts for the size, 0.1
+
+
 def template_diameter(splats: Splats) -> float:
-    """Diagonal of the box that holds the central 98 % of the splats along each axis, in scene units."""
-    low, high = np.quantile(np.asarray(splats.means), [0.01, 0.99], axis=0)
+    """Diagonal of the box that holds the central 98 % of the splats that show along each axis, in scene units."""
+    shown = np.asarray(splats.logit_opacities) > _SHOWN
+    means = np.asarray(splats.means)
+    low, high = np.quantile(means[shown] if shown.any() else means, [0.01, 0.99], axis=0)
     return float(np.linalg.norm(high - low))
 
 

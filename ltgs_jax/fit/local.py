@@ -13,6 +13,7 @@ from ltgs_jax.scene import Splats
 from .optimizer import Rates, adam, scale_gradients
 
 _RATES = Rates(means=4e-3, means_final=4e-4, quats=5e-3, log_scales=1e-2, logit_opacities=8e-2, sh_dc=1e-2, sh_rest=0.0)
+_FADE = 1e-2  # weight on mean opacity: what only repeats the backdrop's colours fades
 
 
 class Windows(eqx.Module):
@@ -37,7 +38,7 @@ def _step(splats: Splats, state, windows: Windows, size, progress, plan: RenderP
         needles = jnp.mean(jax.nn.relu(jnp.ptp(splats.log_scales, axis=-1) - jnp.log(5.0)))
         large = jnp.mean(jax.nn.relu(jnp.max(splats.scales, axis=-1) / size - 0.1))
         loss = jnp.sum(error) / jnp.maximum(3 * jnp.sum(windows.valid), 1)
-        return loss + 0.01 * needles + 0.1 * large + 1e-3 * jnp.mean(splats.opacities), (loss, image, out.overflow)
+        return loss + 0.01 * needles + 0.1 * large + _FADE * jnp.mean(splats.opacities), (loss, image, out.overflow)
 
     gradient, (loss, image, overflow) = jax.grad(objective, has_aux=True)(splats)
     updates, state = adam().update(gradient, state)

@@ -7,18 +7,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
 
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
 from ltgs_jax.match import Instance
-from ltgs_jax.scene import Template
+from ltgs_jax.scene import Splats, Template, transform_splats
 from ltgs_jax.template import (
     Crop,
     Placement,
     Support,
     build_template,
     explained,
+    firm_part,
     make_crop,
     search_template,
     settle_template,
@@ -26,10 +28,11 @@ from ltgs_jax.template import (
 )
 
 from .config import Config
-from .looks import Evidence, Eye, Observation, compare, cone_of, pad_splats
-from .state import Account, State, add_template, extend_background, next_identity, scene_at, set_from
+from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats
+from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
+_LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 _FLAT = 0.15  # height over width under which something on bared ground is the ground itself
 
 
@@ -74,7 +77,6 @@ def place_arrivals(
             continue
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
-        print("SHARE",round(float(share),2))
         crop = _crop_around(instance, observations, evidence, config)
         arrivals.append(Arrival(instance, support, crop, bool(share > _BARED)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
@@ -295,16 +297,49 @@ def _new_object(
     if not config.template.tau_new <= gain <= 1.3:
         progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
         return state, None
-    errors = np.full(template.splats.count, 0.5 * config.detect.guessed, state.errors.dtype)
-    if arrival.bared and _is_flat(template, arrival.support):
+    doubt = 0.5 * config.detect.guessed
+    firm = firm_part(template.splats, arrival.crop)
+    if arrival.bared and (firm.sum() < 8 or _is_flat(template.splats[firm], arrival.support)):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
-        return extend_background(state, template.splats, errors, np.zeros(len(errors), bool)), None
+        return _with_ground(state, template.splats, doubt), None
+    low = arrival.support.height(np.asarray(template.splats.means, np.float64)) < _LOW * template_diameter(
+        template.splats[firm]
+    )
+    state = _with_ground(state, template.splats[~firm & low], doubt)
+    template = eqx.tree_at(lambda m: m.splats, template, template.splats[firm])
+    whole = _part_of(state, t, template.splats)
+    if whole is not None:
+        progress.note(f"visit {t}: more of object {state.chronology.templates[whole].identity}, not seen before")
+        pose = state.chronology.world_from_template[t, whole]
+        piece = on_host(transform_splats(pose.inverse(), template.splats))
+        return extend_template(state, whole, piece, np.full(piece.count, doubt, state.errors.dtype)), None
+    errors = np.full(template.splats.count, doubt, state.errors.dtype)
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", gain, error, arrival.instance.views)
 
 
-def _is_flat(template: Template, support: Support) -> bool:
-    means, weight = np.asarray(template.splats.means, np.float64), np.asarray(template.splats.opacities)
+def _with_ground(state: State, splats: Splats, doubt: float) -> State:
+    return extend_background(state, splats, np.full(splats.count, doubt), np.zeros(splats.count, bool))
+
+
+def _part_of(state: State, t: int, piece: Splats) -> int | None:
+    """The template, away from where the first visit saw it, that a smaller piece against it completes."""
+    means = np.asarray(piece.means)
+    for k, template in enumerate(state.chronology.templates):
+        pose = state.chronology.world_from_template[t, k]
+        first = template.source_visit == 0 and np.abs(np.asarray(pose.xyz)).max() == 0
+        if first or not bool(state.chronology.visible[t, k]):
+            continue
+        size = template_diameter(template.splats)
+        whole = np.asarray(pose.apply(jnp.asarray(template.splats.means)))
+        near = cKDTree(whole).query(means)[0]
+        if np.quantile(near, 0.75) < 0.15 * size and template_diameter(piece) < size:
+            return k
+    return None
+
+
+def _is_flat(splats: Splats, support: Support) -> bool:
+    means, weight = np.asarray(splats.means, np.float64), np.asarray(splats.opacities)
     firm = means[weight > min(0.3, np.quantile(weight, 0.7))]
     width = np.linalg.norm(np.ptp(firm @ support.frame()[:2].T, axis=0))
     return bool(np.median(support.height(firm)) < _FLAT * width)

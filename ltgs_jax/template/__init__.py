@@ -8,6 +8,7 @@ from .arrival import support_below as support_below
 from .background import color_from_photographs as color_from_photographs
 from .background import fill_under as fill_under
 from .config import TemplateConfig as TemplateConfig
+from .firm import firm_part as firm_part
 from .locate import Crop as Crop
 from .locate import Refiner as Refiner
 from .locate import explained as explained

@@ -170,9 +170,14 @@ def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s
 def backdrop_error(crop: Crop) -> tuple[float, float]:
     """Mean over views of the unlikeness with nothing added to the backdrop; and the part of it that lies where the
     object is."""
-    wrong = _unlike_crop(np.asarray(crop.backdrop)[None], crop)
+    wrong = backdrop_unlikeness(crop)
     inside = np.where(np.asarray(crop.region), wrong, 0)
     return float(_view_errors(wrong, crop).mean()), float(_view_errors(inside, crop).mean())
+
+
+def backdrop_unlikeness(crop: Crop) -> Float[np.ndarray, "v s s"]:
+    """How unlike the photographs each pixel is with nothing added to the backdrop."""
+    return _unlike_crop(np.asarray(crop.backdrop)[None], crop)[0]
 
 
 def _unlike_crop(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
@@ -187,9 +192,9 @@ def explained(images: Float[np.ndarray, "v s s 3"], crop: Crop) -> tuple[float, 
     return error, (without - error) / max(change, 1e-9)
 
 
-def _view_errors(wrong: Float[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, "m v"]:
+def _view_errors(wrong: Float[np.ndarray, "*m v s s"], crop: Crop) -> Float[np.ndarray, "*m v"]:
     """Mean unlikeness over the pixels that count."""
-    return np.sum(wrong, axis=(2, 3)) / np.maximum(np.asarray(crop.valid).sum(axis=(1, 2)), 1)
+    return np.sum(wrong, axis=(-2, -1)) / np.maximum(np.asarray(crop.valid).sum(axis=(1, 2)), 1)
 
 
 @eqx.filter_jit

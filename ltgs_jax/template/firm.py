@@ -1,0 +1,54 @@
+"""What of a new object's splats is the object, and what only mends the ground around it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage.filters import threshold_otsu
+
+from ltgs_jax.scene import Splats
+
+from .cut import components
+from .locate import Crop, backdrop_unlikeness
+
+
+def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
+    """The splats of a new object, told from those that only mend the ground around it (shadows, what something hid).
+
+    A splat is firm when every window that sees its place was clearly unlike the photograph without the object; the
+    largest connected piece of these is the object, with all that lies within its outlines.
+    """
+    means = np.asarray(splats.means, np.float64)
+    unlike = np.stack([ndimage.gaussian_filter(u, 1.0) for u in backdrop_unlikeness(crop)])
+    seen, rows, columns = _pixels_of(means, crop)
+    views = np.arange(len(unlike))[:, None]
+    least = np.where(seen, unlike[views, rows, columns], np.inf).min(axis=0)
+    shown = (np.asarray(splats.opacities) > 0.1) & np.isfinite(least)
+    if shown.sum() < 8:
+        return np.ones(len(means), bool)
+    firm = np.flatnonzero(shown & (least > min(threshold_otsu(least[shown]), 0.75 * np.quantile(least[shown], 0.75))))
+    spacing = np.median(cKDTree(means[firm]).query(means[firm], k=min(4, len(firm)))[0][:, -1])
+    largest = firm[components(means[firm], 3 * spacing) == 0]
+    outlines = np.zeros(unlike.shape, bool)
+    for view, outline in enumerate(outlines):
+        inside = largest[seen[view, largest]]
+        outline[rows[view, inside], columns[view, inside]] = True
+        outlines[view] = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(outline, 4), iterations=3))[4:-4, 4:-4]
+    within = outlines[views, rows, columns] | ~seen
+    return within.all(axis=0) & seen.any(axis=0)
+
+
+def _pixels_of(means: Float[np.ndarray, "n 3"], crop: Crop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether each window sees the place of each splat, and the row and column of the pixel that does, all [v n]."""
+    xy, z = jax.vmap(lambda camera: camera.project(jnp.asarray(means, jnp.float32)))(crop.camera)
+    size = crop.camera.width
+    column, row = np.floor(np.nan_to_num(np.moveaxis(np.asarray(xy), -1, 0), nan=-1.0)).clip(-1, size).astype(int)
+    seen = (np.asarray(z) > 1e-3) & (row >= 0) & (row < size) & (column >= 0) & (column < size)
+    row, column = row.clip(0, size - 1), column.clip(0, size - 1)
+    views = np.arange(len(seen))[:, None]
+    behind = np.asarray(crop.depth)[views, row, column]
+    tolerance = 0.1 * np.linalg.norm(np.ptp(means, axis=0))
+    seen &= np.asarray(crop.valid)[views, row, column] & ((np.asarray(z) < behind + tolerance) | (behind <= 0))
+    return seen, row, column
