@@ -97,6 +97,7 @@ STARTS = np.array(
 )
 
 
+@pytest.mark.slow
 def test_starts_five_degrees_and_a_twentieth_of_the_size_off_converge(scene):
     template, views = scene
     fit = refine_pose(template, moved(STARTS), views, size=SIZE, reach=REACH)

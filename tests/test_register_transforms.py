@@ -13,6 +13,7 @@ from ltgs_jax.register.hypotheses import BLOCK, Problem, search
 from ltgs_jax.register.outcome import Effort, RegisterConfig
 
 
+@pytest.mark.slow
 def test_a_batch_gives_the_answers_of_its_problems():
     """Under jit and vmap, problems of different difficulty in one call."""
     cases = [problem(seed, 100, outliers) for seed, outliers in ((1, 0.0), (2, 0.6), (3, 0.85))]

@@ -22,7 +22,7 @@ from .views import StreamedView, View, plan_for, scene_extent, size_of
 class LongConfig:
     """How the chronology is refined (section 3.4 of the LTGS paper)."""
 
-    steps: int = 300
+    steps: int = 200
     """Adam steps, one photograph each."""
     replay: float = 0.4
     """Share of the steps spent on photographs of the first visit, against forgetting."""

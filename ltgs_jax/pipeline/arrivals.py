@@ -46,6 +46,17 @@ class Arrival(eqx.Module):
     bared: bool
 
 
+class NewObject(eqx.Module):
+    """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
+    in the windows, what is left unlike the photographs, and the share of the change that it explains."""
+
+    template: Template
+    firm: Bool[np.ndarray, " n"]
+    outlines: Bool[np.ndarray, "v s s"]
+    error: float
+    gain: float
+
+
 def place_arrivals(
     state: State,
     t: int,
@@ -65,8 +76,7 @@ def place_arrivals(
     """Known templates for what came, by photometric evidence and one assignment; new objects for the rest.
 
     `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground, or
-    did show what left. `surface`:
-    points of the known scene.
+    did show what left. `surface`: points of the known scene.
     """
     arrivals = []
     cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
@@ -80,7 +90,22 @@ def place_arrivals(
         crop = _crop_around(instance, observations, evidence, config)
         arrivals.append(Arrival(instance, support, crop, bool(share > _BARED)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
-    accounts = []
+    accounts, news = [], {}
+    tools = {"config": config, "rng": rng}
+    for (i, k), found in list(placements.items()):
+        if not _convincing(found, config):
+            continue
+        if i not in news:
+            news[i] = _as_new(state, t, arrivals[i], observations, evidence, **tools)
+        if news[i] is None or news[i].gain < config.template.tau_new:
+            continue
+        shape = _same_shape(found, news[i], arrivals[i].crop)
+        if shape < config.template.tau_shape:
+            identity = state.chronology.templates[k].identity
+            progress.note(
+                f"visit {t}: arrival {i} is not object {identity}: the overlap of their outlines is {shape:.2f}"
+            )
+            del placements[i, k]
     pairs = _assigned(len(arrivals), placements, config)
     wrong = _unexplained(state, t, pairs, placements, observations, evidence, front_end, eye=eye, config=config)
     for i, k in pairs:
@@ -96,9 +121,9 @@ def place_arrivals(
             kind = "moved" if k in gone else "added"
             accounts.append(Account(k, kind, placement.gain, placement.error, arrival.instance.views))
         else:
-            state, account = _new_object(
-                state, t, arrival, observations, evidence, eye=eye, config=config, rng=rng, progress=progress
-            )
+            if i not in news:
+                news[i] = _as_new(state, t, arrival, observations, evidence, **tools)
+            state, account = _add_new(state, t, arrival, news[i], config, progress)
             accounts += [account] if account is not None else []
     return state, accounts
 
@@ -274,10 +299,10 @@ def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: 
     return [(i, known[j] if j < len(known) and cost[i, j] < 0 else None) for i, j in pairs]
 
 
-def _new_object(
-    state: State, t: int, arrival: Arrival, observations, evidence: Evidence, *, eye: Eye, config: Config, rng, progress
-) -> tuple[State, Account | None]:
-    """A template for something never seen before; ground that something had hidden joins the background instead."""
+def _as_new(
+    state: State, t: int, arrival: Arrival, observations, evidence: Evidence, *, config: Config, rng
+) -> NewObject | None:
+    """An arrival as something never seen before; None where its outlines enclose nothing."""
     cones = [cone_of(o.camera, o.valid, o.valid, look) for o, look in zip(observations, evidence.looks, strict=True)]
     template = build_template(
         arrival.instance,
@@ -291,31 +316,47 @@ def _new_object(
         config=config.template,
     )
     if template is None:
-        return state, None
+        return None
     template, error, gain = _settle_new(template, arrival.crop, config)
-    # More than the change itself: it improves what did not change, and is no account of what did.
-    if not config.template.tau_new <= gain <= 1.3:
-        progress.note(f"visit {t}: a change left out, as a new object it explains {gain:.2f} of it")
+    firm, outlines = firm_part(template.splats, arrival.crop)
+    return NewObject(template, firm, outlines, error, gain)
+
+
+def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
+    """Mean over views of the overlap (IoU) of a known template's outlines with those of the change as a new object."""
+    valid = np.asarray(crop.valid)
+    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
+    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
+    return float(np.mean((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
+
+
+def _add_new(
+    state: State, t: int, arrival: Arrival, new: NewObject | None, config: Config, progress
+) -> tuple[State, Account | None]:
+    """The state with a new template; ground that something had hidden joins the background instead."""
+    if new is None:
         return state, None
-    doubt = 0.5 * config.detect.guessed
-    firm = firm_part(template.splats, arrival.crop)
-    if arrival.bared and (firm.sum() < 8 or _is_flat(template.splats[firm], arrival.support)):
+    # More than the change itself: it improves what did not change, and is no account of what did.
+    if not config.template.tau_new <= new.gain <= 1.3:
+        progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
+        return state, None
+    doubt, splats = 0.5 * config.detect.guessed, new.template.splats
+    if arrival.bared and (new.firm.sum() < 8 or _is_flat(splats[new.firm], arrival.support)):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
-        return _with_ground(state, template.splats, doubt), None
-    low = arrival.support.height(np.asarray(template.splats.means, np.float64)) < _LOW * template_diameter(
-        template.splats[firm]
-    )
-    state = _with_ground(state, template.splats[~firm & low], doubt)
-    template = eqx.tree_at(lambda m: m.splats, template, template.splats[firm])
-    whole = _part_of(state, t, template.splats)
+        return _with_ground(state, splats, doubt), None
+    object_splats = splats[new.firm]
+    low = arrival.support.height(np.asarray(splats.means, np.float64)) < _LOW * template_diameter(object_splats)
+    state = _with_ground(state, splats[~new.firm & low], doubt)
+    whole = _part_of(state, t, object_splats)
     if whole is not None:
         progress.note(f"visit {t}: more of object {state.chronology.templates[whole].identity}, not seen before")
         pose = state.chronology.world_from_template[t, whole]
-        piece = on_host(transform_splats(pose.inverse(), template.splats))
+        piece = on_host(transform_splats(pose.inverse(), object_splats))
         return extend_template(state, whole, piece, np.full(piece.count, doubt, state.errors.dtype)), None
-    errors = np.full(template.splats.count, doubt, state.errors.dtype)
+    errors = np.full(object_splats.count, doubt, state.errors.dtype)
+    template = Template(object_splats, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
-    return state, Account(len(state.chronology.templates) - 1, "added", gain, error, arrival.instance.views)
+    return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, arrival.instance.views)
 
 
 def _with_ground(state: State, splats: Splats, doubt: float) -> State:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from ltgs_jax.geometry import C0, SE3, quat_from_rotmat
@@ -20,13 +20,14 @@ from .support import Support, fit_support, rotation_about
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
-    its outlines that lies on the change, and its structural likeness to the photographs."""
+    its outlines that lies on the change, its structural likeness to the photographs, its outlines in the windows."""
 
     world_from_template: SE3
     error: float
     gain: float
     overlap: float
     likeness: float
+    outlines: Bool[np.ndarray, "v s s"]
 
 
 def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -168,7 +169,9 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     pose = found.poses[int(np.argmin(found.errors))]
     images, cover = refiner.images(search.template, pose[None], crop, tolerance)
     error, gain = explained(images[0], crop)
-    return Placement(pose, error, gain, float(overlap_of(cover > 0.5, crop)[0]), likeness(images[0], cover[0], crop))
+    covered = cover > 0.5
+    alike = likeness(images[0], cover[0], crop)
+    return Placement(pose, error, gain, float(overlap_of(covered, crop)[0]), alike, covered[0])
 
 
 def _unlike(

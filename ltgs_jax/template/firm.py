@@ -14,9 +14,10 @@ from .cut import components
 from .locate import Crop, backdrop_unlikeness
 
 
-def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
-    """The splats of a new object, told from those that only mend the ground around it (shadows, what something hid).
+def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, "v s s"]]:
+    """The splats that are a new object, and its outlines in the windows.
 
+    The others only mend the ground around it: shadows, what something had hidden.
     A splat is firm when every window that sees its place was clearly unlike the photograph without the object; the
     largest connected piece of these is the object, with all that lies within its outlines.
     """
@@ -27,7 +28,7 @@ def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
     least = np.where(seen, unlike[views, rows, columns], np.inf).min(axis=0)
     shown = (np.asarray(splats.opacities) > 0.1) & np.isfinite(least)
     if shown.sum() < 8:
-        return np.ones(len(means), bool)
+        return np.ones(len(means), bool), np.asarray(crop.region)
     firm = np.flatnonzero(shown & (least > min(threshold_otsu(least[shown]), 0.75 * np.quantile(least[shown], 0.75))))
     spacing = np.median(cKDTree(means[firm]).query(means[firm], k=min(4, len(firm)))[0][:, -1])
     largest = firm[components(means[firm], 3 * spacing) == 0]
@@ -37,7 +38,7 @@ def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
         outline[rows[view, inside], columns[view, inside]] = True
         outlines[view] = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(outline, 4), iterations=3))[4:-4, 4:-4]
     within = outlines[views, rows, columns] | ~seen
-    return within.all(axis=0) & seen.any(axis=0)
+    return within.all(axis=0) & seen.any(axis=0), outlines
 
 
 def _pixels_of(means: Float[np.ndarray, "n 3"], crop: Crop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
