@@ -6,12 +6,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from skimage.filters import threshold_otsu
 
 from ltgs_jax.scene import Splats
 
 from .cut import components
 from .locate import Crop, backdrop_unlikeness
+
+_FIRM = 0.65  # of the upper quartile of unlikeness: where Otsu's threshold fell on objects of several scenes
 
 
 def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, "v s s"]]:
@@ -29,7 +30,7 @@ def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[
     shown = (np.asarray(splats.opacities) > 0.1) & np.isfinite(least)
     if shown.sum() < 8:
         return np.ones(len(means), bool), np.asarray(crop.region)
-    firm = np.flatnonzero(shown & (least > min(threshold_otsu(least[shown]), 0.75 * np.quantile(least[shown], 0.75))))
+    firm = np.flatnonzero(shown & (least > _FIRM * np.quantile(least[shown], 0.75)))
     spacing = np.median(cKDTree(means[firm]).query(means[firm], k=min(4, len(firm)))[0][:, -1])
     largest = firm[components(means[firm], 3 * spacing) == 0]
     outlines = np.zeros(unlike.shape, bool)
