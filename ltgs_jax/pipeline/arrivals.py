@@ -100,10 +100,10 @@ def place_arrivals(
         if news[i] is None or news[i].gain < config.template.tau_new:
             continue
         shape = _same_shape(found, news[i], arrivals[i].crop)
-        if shape < config.template.tau_shape:
+        if shape * found.likeness < config.template.tau_same:
             identity = state.chronology.templates[k].identity
             progress.note(
-                f"visit {t}: arrival {i} is not object {identity}: the overlap of their outlines is {shape:.2f}"
+                f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f} only"
             )
             del placements[i, k]
     pairs = _assigned(len(arrivals), placements, config)
@@ -323,11 +323,11 @@ def _as_new(
 
 
 def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
-    """Mean over views of the overlap (IoU) of a known template's outlines with those of the change as a new object."""
+    """The least, over views, overlap (IoU) of a known template's outlines with those of the change as a new object."""
     valid = np.asarray(crop.valid)
     both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
     either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
-    return float(np.mean((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
+    return float(np.min((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
 
 
 def _add_new(
