@@ -33,7 +33,7 @@ from .state import Account, State, add_template, extend_background, extend_templ
 
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
-_FLAT = 0.15  # height over width under which something on bared ground is the ground itself
+_FLAT = 0.25  # height over width under which something on bared ground is the ground itself
 
 
 class Arrival(eqx.Module):

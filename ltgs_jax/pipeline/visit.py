@@ -16,6 +16,8 @@ from .departures import take_out
 from .looks import Evidence, Eye, Observation, compare, cone_of
 from .state import Account, State, doubt_template, drop_template, extend_background, scene_at, set_from
 
+_LEAST_SHOWN = 6  # times the least evidence for an object, dilated outlines included, below which nothing is seen of it
+
 
 def explain_visit(
     state: State,
@@ -106,8 +108,10 @@ def _put_back(
         alternative = set_from(state, t, k, visible=True, pose=before)
         splats = scene_at(alternative, t)[0]
         others = [eye.image(splats, o.camera) for o in observations]
-        left, stayed = _unlike_where_different(images, others, observations)
-        if stayed <= left * (1 + config.template.still_margin):
+        left, stayed, shown = _unlike_where_different(images, others, observations)
+        # What hardly shows either way, under something that came, gives no account of itself.
+        hidden = shown < _LEAST_SHOWN * config.template.min_pixels
+        if hidden or stayed <= left * (1 + config.template.still_margin):
             progress.note(
                 f"visit {t}: object {state.chronology.templates[k].identity} stays where it was "
                 f"(unlikeness {stayed:.3f} there, {left:.3f} without)"
@@ -149,11 +153,13 @@ def _learn_errors(
 
 def _unlike_where_different(
     images: Sequence[Float[np.ndarray, "h w 3"]], others: Sequence[Float[np.ndarray, "h w 3"]], observations
-) -> tuple[float, float]:
-    """Mean unlikeness to the photographs of two renders of each, over the pixels in which they differ."""
+) -> tuple[float, float, float]:
+    """Mean unlikeness to the photographs of two renders of each, over the pixels in which they differ; and the share of
+    all pixels that these are."""
     sums = np.zeros(3)
     for image, other, o in zip(images, others, observations, strict=True):
         different = dilate(np.abs(image - other).max(axis=-1) > 0.05, 1) & o.valid
         both = np.asarray(unlikeness(np.stack([image, other])[:, None], o.image[None], o.valid[None]))[:, 0]
         sums += [*(both * different).sum(axis=(1, 2)), different.sum()]
-    return float(sums[0] / max(sums[2], 1)), float(sums[1] / max(sums[2], 1))
+    area = sum(o.valid.size for o in observations)
+    return float(sums[0] / max(sums[2], 1)), float(sums[1] / max(sums[2], 1)), float(sums[2] / area)
