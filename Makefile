@@ -1,16 +1,18 @@
 # Two commands on a bare machine with Python 3.11 or newer: `make demo` and `make test`.
 # PYTHON=… chooses the interpreter, EXTRAS=dev,demo,view,onnx,experiments,cuda13 what is installed, OUT=… the demo's folder.
+# The demo installs only what it runs with; the tests add the rest to the same environment.
 
 VENV := .venv
 EXTRAS ?= dev,demo,view,onnx,experiments
 OUT ?= demo_out
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+DEMO_STAMP := $(VENV)/installed-demo
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 
 .PHONY: demo test slow check format docs install lock clean
 
-demo: $(STAMP)
+demo: $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
 	$(BIN)/ltgs demo --out $(OUT)
 
 test: $(STAMP)
@@ -37,6 +39,11 @@ install: $(STAMP)
 $(STAMP): pyproject.toml requirements.lock .ci/make-venv
 	.ci/make-venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[$(EXTRAS)]'
+	touch $@
+
+$(DEMO_STAMP): pyproject.toml requirements.lock .ci/make-venv
+	.ci/make-venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[demo]'
 	touch $@
 
 lock: $(STAMP)
