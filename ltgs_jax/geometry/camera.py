@@ -25,6 +25,7 @@ class Camera(eqx.Module):
         """Camera centre in the world."""
         return self.cam_from_world.inverse().xyz
 
+    @jax.jit
     def project(self, points: Float[Array, "... n 3"]) -> tuple[Float[Array, "... n 2"], Float[Array, "... n"]]:
         """Pixels and camera z of world points; pixels mean nothing where z ≤ 0."""
         local = self.cam_from_world.apply(points)
@@ -34,12 +35,14 @@ class Camera(eqx.Module):
         centre = self.K[..., None, :2, 2]
         return local[..., :2] / safe[..., None] * focal + centre, z
 
+    @jax.jit
     def unproject(self, pixels: Float[Array, "... n 2"], depths: Float[Array, "... n"]) -> Float[Array, "... n 3"]:
         """World points at pixel positions and camera z."""
         focal = jnp.stack([self.K[..., 0, 0], self.K[..., 1, 1]], axis=-1)[..., None, :]
         xy = (pixels - self.K[..., None, :2, 2]) / focal * depths[..., None]
         return self.cam_from_world.inverse().apply(jnp.concatenate([xy, depths[..., None]], axis=-1))
 
+    @jax.jit
     def rays(self, pixels: Float[Array, "n 2"]) -> tuple[Float[Array, "3"], Float[Array, "n 3"]]:
         """Centre and unit directions in the world of pixel positions."""
         xy = (pixels - self.K[:2, 2]) / jnp.stack([self.K[0, 0], self.K[1, 1]])

@@ -128,23 +128,27 @@ class SE3(eqx.Module):
         """Rotation matrices."""
         return rotmat_from_quat(self.quat)
 
+    @jax.jit
     def as_matrix(self) -> Float[Array, "... 4 4"]:
         """4×4 matrices."""
         top = jnp.concatenate([self.rotmat(), self.xyz[..., None]], axis=-1)
         bottom = jnp.broadcast_to(jnp.zeros(4, top.dtype).at[3].set(1), (*top.shape[:-2], 1, 4))
         return jnp.concatenate([top, bottom], axis=-2)
 
+    @jax.jit
     def inverse(self) -> "SE3":
         """a_from_b of b_from_a."""
         conjugate = self.quat * jnp.asarray([1, -1, -1, -1], self.quat.dtype)
         rotated = jnp.einsum("...ij,...j->...i", rotmat_from_quat(conjugate), self.xyz, precision=Precision.HIGHEST)
         return SE3(conjugate, -rotated)
 
+    @jax.jit
     def apply(self, points: Float[Array, "... n 3"]) -> Float[Array, "... n 3"]:
         """Move points; the rotation matrix is formed once, not per point."""
         rotated = jnp.einsum("...ij,...nj->...ni", self.rotmat(), points, precision=Precision.HIGHEST)
         return rotated + self.xyz[..., None, :]
 
+    @jax.jit
     def __matmul__(self, other: "SE3") -> "SE3":
         """Composition: (self @ other)(x) = self(other(x))."""
         moved = jnp.einsum("...ij,...j->...i", self.rotmat(), other.xyz, precision=Precision.HIGHEST)

@@ -60,16 +60,15 @@ def _normalized(splats: Splats, count: int) -> Splats:
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     distances = np.linalg.norm(points - middle, axis=1)
     radius = max(float(np.quantile(distances, 0.98)) if len(points) else 1.0, 1e-6)
-    moved = Splats(
-        (splats.means - jnp.asarray(middle, splats.means.dtype)) / radius,
-        splats.quats,
-        splats.log_scales - np.log(radius).astype(splats.log_scales.dtype),
-        splats.logit_opacities,
-        splats.sh,
+    quats = np.pad(splats.quats, ((0, missing), (0, 0)))
+    quats[splats.count :, 0] = 1
+    return Splats(
+        jnp.asarray(np.pad((points - middle) / radius, ((0, missing), (0, 0))), splats.means.dtype),
+        jnp.asarray(quats),
+        jnp.asarray(np.pad(splats.log_scales, ((0, missing), (0, 0))) - np.log(radius), splats.log_scales.dtype),
+        jnp.asarray(np.pad(splats.logit_opacities, (0, missing), constant_values=-np.inf)),
+        jnp.asarray(np.pad(splats.sh, ((0, missing), (0, 0), (0, 0)))),
     )
-    filled = jax.tree.map(lambda x: jnp.pad(x, [(0, missing)] + [(0, 0)] * (x.ndim - 1)), moved)
-    logits = jnp.where(jnp.arange(count) < splats.count, filled.logit_opacities, -jnp.inf)
-    return Splats(filled.means, filled.quats.at[splats.count :, 0].set(1), filled.log_scales, logits, filled.sh)
 
 
 def _ring(up: Float[np.ndarray, "3"]) -> Camera:

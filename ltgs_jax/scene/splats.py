@@ -38,8 +38,17 @@ class Splats(eqx.Module):
         return jax.nn.sigmoid(self.logit_opacities)
 
     def __getitem__(self, index: Bool[Array, " n"] | Int[Array, " m"] | slice) -> "Splats":
-        """A subset, by mask, indices or slice."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
+        """A subset, by mask, indices or slice; taken on the host outside transformations, where a new number of splats
+        costs no compilation."""
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, index))):
+            return jax.tree.map(lambda leaf: leaf[index], self)
+        rows = index if isinstance(index, slice) else np.asarray(index)
+        return jax.tree.map(
+            lambda leaf: (
+                np.asarray(leaf)[rows] if isinstance(leaf, np.ndarray) else jnp.asarray(np.asarray(leaf)[rows])
+            ),
+            self,
+        )
 
 
 def concatenate_splats(parts: list[Splats]) -> Splats:

@@ -94,9 +94,9 @@ def thin(splats: Splats, most: int) -> Splats:
     invisible ones, so that every template runs in one compiled program."""
     if splats.count <= most:
         missing = most - splats.count
-        padded = jax.tree.map(lambda leaf: jnp.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
-        faint = padded.logit_opacities.at[splats.count :].set(-jnp.inf)
-        return eqx.tree_at(lambda s: s.logit_opacities, padded, faint)
+        padded = jax.tree.map(lambda leaf: np.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
+        padded.logit_opacities[splats.count :] = -np.inf
+        return jax.tree.map(jnp.asarray, padded)
     area = np.exp(np.sum(np.sort(np.asarray(splats.log_scales), axis=1)[:, 1:], axis=1)) * np.asarray(splats.opacities)
     keep = np.sort(np.argsort(-area, kind="stable")[:most])
     grow = 0.5 * np.log(area.sum() / area[keep].sum())
