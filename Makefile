@@ -1,6 +1,6 @@
 # Two commands on a bare machine with Python 3.11 or newer: `make demo` and `make test`.
 # PYTHON=… chooses the interpreter, EXTRAS=dev,demo,view,onnx,experiments,cuda13 what is installed, OUT=… the demo's folder.
-# The demo installs only what it runs with; the tests add the rest to the same environment.
+# The demo installs only what it runs with, and leaves byte code to the first import; the tests add the rest to the same environment.
 
 VENV := .venv
 EXTRAS ?= dev,demo,view,onnx,experiments
@@ -43,7 +43,7 @@ $(STAMP): pyproject.toml requirements.lock .ci/make-venv
 
 $(DEMO_STAMP): pyproject.toml requirements.lock .ci/make-venv
 	.ci/make-venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c requirements.lock -e '.[demo]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -c requirements.lock -e '.[demo]'
 	touch $@
 
 lock: $(STAMP)

@@ -43,12 +43,8 @@ class Splats(eqx.Module):
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((self, index))):
             return jax.tree.map(lambda leaf: leaf[index], self)
         rows = index if isinstance(index, slice) else np.asarray(index)
-        return jax.tree.map(
-            lambda leaf: (
-                np.asarray(leaf)[rows] if isinstance(leaf, np.ndarray) else jnp.asarray(np.asarray(leaf)[rows])
-            ),
-            self,
-        )
+        taken = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], self)
+        return taken if isinstance(self.means, np.ndarray) else jax.device_put(taken)
 
 
 def concatenate_splats(parts: list[Splats]) -> Splats:

@@ -96,7 +96,7 @@ def thin(splats: Splats, most: int) -> Splats:
         missing = most - splats.count
         padded = jax.tree.map(lambda leaf: np.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
         padded.logit_opacities[splats.count :] = -np.inf
-        return jax.tree.map(jnp.asarray, padded)
+        return jax.device_put(padded)
     area = np.exp(np.sum(np.sort(np.asarray(splats.log_scales), axis=1)[:, 1:], axis=1)) * np.asarray(splats.opacities)
     keep = np.sort(np.argsort(-area, kind="stable")[:most])
     grow = 0.5 * np.log(area.sum() / area[keep].sum())

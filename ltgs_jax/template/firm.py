@@ -1,12 +1,12 @@
 """What of a new object's splats is the object, and what only mends the ground around it."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
 from .cut import components
@@ -42,9 +42,12 @@ def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[
     return within.all(axis=0) & seen.any(axis=0), outlines
 
 
+_project = jax.jit(jax.vmap(Camera.project, (0, None)))
+
+
 def _pixels_of(means: Float[np.ndarray, "n 3"], crop: Crop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether each window sees the place of each splat, and the row and column of the pixel that does, all [v n]."""
-    xy, z = jax.vmap(lambda camera: camera.project(jnp.asarray(means, jnp.float32)))(crop.camera)
+    xy, z = _project(crop.camera, np.asarray(means, np.float32))
     size = crop.camera.width
     column, row = np.floor(np.nan_to_num(np.moveaxis(np.asarray(xy), -1, 0), nan=-1.0)).clip(-1, size).astype(int)
     seen = (np.asarray(z) > 1e-3) & (row >= 0) & (row < size) & (column >= 0) & (column < size)
