@@ -111,7 +111,7 @@ def _plans(splats: Splats, views: Sequence[View | StreamedView]) -> dict[tuple[i
     """One plan per image size."""
     sizes = sorted({size_of(view) for view in views})
     # Roomy, since every new plan is a new compilation: splats shrink while they are fitted, but their number grows.
-    return {size: plan_for([(splats, v.camera) for v in views if size_of(v) == size], slack=2.5) for size in sizes}
+    return {size: plan_for([(splats, v.camera) for v in views if size_of(v) == size], slack=4) for size in sizes}
 
 
 def fit_initial(

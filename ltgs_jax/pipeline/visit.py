@@ -159,7 +159,7 @@ def _unlike_where_different(
     sums = np.zeros(3)
     for image, other, o in zip(images, others, observations, strict=True):
         different = dilate(np.abs(image - other).max(axis=-1) > 0.05, 1) & o.valid
-        both = np.asarray(unlikeness(np.stack([image, other])[:, None], o.image[None], o.valid[None]))[:, 0]
+        both = np.concatenate([unlikeness(shown[None], o.image[None], o.valid[None]) for shown in (image, other)])
         sums += [*(both * different).sum(axis=(1, 2)), different.sum()]
     area = sum(o.valid.size for o in observations)
     return float(sums[0] / max(sums[2], 1)), float(sums[1] / max(sums[2], 1)), float(sums[2] / area)

@@ -30,7 +30,7 @@ def _settle(kind: tuple, pairs: int, rounds: int, slack: float) -> RenderPlan:
     fits = [
         plan
         for plan in plans
-        if least * pairs <= plan.intersections <= most * max(pairs, 1024)
+        if least * pairs <= plan.intersections <= most * max(pairs, 8192)
         and least * rounds <= plan.rounds <= most * max(rounds, 16)
     ]
     if fits:

@@ -1,6 +1,5 @@
 """Each template rendered alone, from a few sides."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float

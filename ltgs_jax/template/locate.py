@@ -128,8 +128,8 @@ _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 
 @eqx.filter_jit
 def unlikeness(
-    images: Float[Array, "m v h w 3"], target: Float[Array, "v h w 3"], valid: Bool[Array, "v h w"]
-) -> Float[Array, "m v h w"]:
+    images: Float[Array, "v h w 3"], target: Float[Array, "v h w 3"], valid: Bool[Array, "v h w"]
+) -> Float[Array, "v h w"]:
     """How unlike the photographs `target` each pixel of the renders is, 0…1: half by colour, capped, half by structure,
     which survives other shading; 0 where a pixel does not count."""
     colour = jnp.minimum(jnp.mean(jnp.abs(images - target), axis=-1), _CAP) / _CAP
@@ -137,7 +137,8 @@ def unlikeness(
     return (0.5 * colour + 0.5 * jnp.clip(structure, 0, 1)) * valid
 
 
-def _structure(a: Float[Array, "m v s s"], b: Float[Array, "v s s"]) -> Float[Array, "m v s s"]:
+@jax.jit
+def _structure(a: Float[Array, "v s s"], b: Float[Array, "v s s"]) -> Float[Array, "v s s"]:
     """Covariance over variances of two grey images in binomial windows of 7 px: SSIM without its luminance term."""
     mean_a, mean_b = _window_mean(a), _window_mean(b)
     var_a, var_b = _window_mean(a * a) - mean_a**2, _window_mean(b * b) - mean_b**2
@@ -157,7 +158,7 @@ def _window_mean(image: Float[Array, "*b h w"]) -> Float[Array, "*b h w"]:
 
 def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop) -> float:
     """Mean structural agreement where the template shows, −1…1, in the middle of the views that show enough of it."""
-    agreement = np.asarray(_structure(jnp.mean(images, axis=-1)[None], jnp.mean(crop.target, axis=-1)))[0]
+    agreement = np.asarray(_structure(np.mean(images, axis=-1), np.mean(crop.target, axis=-1)))
     shown = (cover > 0.5) & np.asarray(crop.valid)
     pixels = shown.sum(axis=(1, 2))
     enough = pixels > max(0.2 * pixels.max(), 8)
@@ -181,7 +182,7 @@ def backdrop_unlikeness(crop: Crop) -> Float[np.ndarray, "v s s"]:
 
 
 def _unlike_crop(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
-    return np.asarray(unlikeness(images, crop.target, crop.valid))
+    return np.stack([unlikeness(image, crop.target, crop.valid) for image in images])  # one program for any m
 
 
 def explained(images: Float[np.ndarray, "v s s 3"], crop: Crop) -> tuple[float, float]:
