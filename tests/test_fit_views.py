@@ -55,6 +55,7 @@ def test_half_views_are_streamed_too():
         assert (half.camera.width, half.camera.height) == (20, 15)
 
 
+@pytest.mark.slow
 def test_a_streamed_fit_is_the_same_fit():
     views = [_view(i) for i in range(3)]
     points = np.random.default_rng(0).uniform([-1, -1, -0.5], [1, 1, 0.5], (60, 3))
