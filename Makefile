@@ -1,9 +1,10 @@
 # Two commands on a bare machine with Python 3.11 or newer: `make demo` and `make test`.
 # PYTHON=… chooses the interpreter, EXTRAS=dev,demo,view,onnx,experiments,cuda13 what is installed, OUT=… the demo's folder.
-# The demo installs only what it runs with, and leaves byte code to the first import; the tests add the rest to the same environment.
+# The demo installs only what it runs with (DEMO_EXTRAS=demo,cuda13 …), and leaves byte code to the first import; the tests add the rest.
 
 VENV := .venv
 EXTRAS ?= dev,demo,view,onnx,experiments
+DEMO_EXTRAS ?= demo
 OUT ?= demo_out
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
@@ -43,7 +44,7 @@ $(STAMP): pyproject.toml requirements.lock .ci/make-venv
 
 $(DEMO_STAMP): pyproject.toml requirements.lock .ci/make-venv
 	.ci/make-venv $(VENV)
-	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -c requirements.lock -e '.[demo]'
+	$(BIN)/python -m pip install --no-compile --quiet --disable-pip-version-check -c requirements.lock -e '.[$(DEMO_EXTRAS)]'
 	touch $@
 
 lock: $(STAMP)
