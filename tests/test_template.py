@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ltgs_jax.geometry import C0, SE3, Camera, rotation_angle, stack_cameras
+from ltgs_jax.match import Cone
 from ltgs_jax.render import render
 from ltgs_jax.scene import Splats, Template
 from ltgs_jax.template import (
@@ -12,12 +13,15 @@ from ltgs_jax.template import (
     Refiner,
     Support,
     TemplateConfig,
+    Vantage,
     fill_under,
     find_removed,
     fit_support,
     search_template,
     settle_template,
 )
+from ltgs_jax.template.arrival import pose_hypotheses, tilts_of
+from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.removal import gone_evidence
 
@@ -51,7 +55,36 @@ def _box(rng: np.random.Generator, count: int = 400) -> tuple[np.ndarray, np.nda
     return points * half + [0, 0, half[2]], palette[2 * face + (sign > 0)]
 
 
-_CAMERAS = np.array([[2.0, 0, 1.5], [-1, 1.7, 1.5], [-1, -1.7, 1.5]])
+def _looking(center, target):
+    """world_from_cam [4 4] of a camera held upright: x to the right, y down, z ahead."""
+    ahead = (target - center) / np.linalg.norm(target - center)
+    right = np.cross(ahead, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3] = np.stack([right, np.cross(ahead, right), ahead, center], axis=1)
+    return pose
+
+
+_CENTERS = np.array([[2.0, 0, 1.5], [-1, 1.7, 1.5], [-1, -1.7, 1.5]])
+_CAMERAS = Vantage.of_cameras(np.stack([_looking(center, np.zeros(3)) for center in _CENTERS]))
+
+
+def test_up_is_level_in_all_photographs():
+    np.testing.assert_allclose(_CAMERAS.up, [0, 0, 1], atol=2e-3)
+    beside = [_looking(np.array([2.0, y, 1.5]), np.array([0, y, 0])) for y in (-0.1, 0, 0.1)]
+    up = Vantage.of_cameras(np.stack(beside)).up
+    assert abs(up[1]) < 1e-9 and up[2] > 0.75  # one axis is all that cameras side by side fix
+
+
+def test_what_touches_a_slope_stands_on_the_level_below_it():
+    rng = np.random.default_rng(3)
+    box, _ = _box(rng)
+    slope = rng.uniform([-0.5, 0.1, 0], [0.5, 0.5, 0], (4000, 3))
+    slope[:, 2] = 0.45 * slope[:, 1]  # leans on the box, shows as many splats as the table does
+    points = np.concatenate([_table(rng), slope])
+    support = fit_support(points, np.ones(len(points)), box + np.array([0, 0, 0.05]), _CAMERAS, rng=rng)
+    assert support is not None
+    np.testing.assert_allclose(support.normal, [0, 0, 1], atol=0.02)
 
 
 def test_support_is_the_table_not_the_wall():
@@ -65,6 +98,22 @@ def test_support_is_the_table_not_the_wall():
     assert abs(support.offset) < 0.01
     np.testing.assert_allclose(support.frame() @ support.frame().T, np.eye(3), atol=1e-12)
     assert np.linalg.det(support.frame()) > 0
+
+
+def test_a_template_without_its_foot_keeps_its_height():
+    rng = np.random.default_rng(0)
+    box, _ = _box(rng)
+    seen = box[box[:, 2] > 0.4 * box[:, 2].max()]
+    stood_on = Support(np.array([0, 0, 1.0]), 0.0, 1e-3)
+    stands_on = Support(np.array([0, 0, 1.0]), 0.3, 1e-3)
+    poses = pose_hypotheses(seen, stood_on, stands_on, np.array([1.0, 2, 0]), turns=4, spread=0.5)
+    moved = np.asarray(poses.apply(jnp.asarray(seen, jnp.float32)))
+    np.testing.assert_allclose(moved[..., 2], np.broadcast_to(seen[:, 2] + 0.3, moved.shape[:2]), atol=1e-5)
+    lying = pose_hypotheses(
+        seen, stood_on, stands_on, np.array([1.0, 2, 0]), turns=4, spread=0.5, tilts=tilts_of(stood_on)
+    )
+    lowest = np.quantile(np.asarray(lying.apply(jnp.asarray(seen, jnp.float32)))[..., 2], 0.02, axis=1)
+    np.testing.assert_allclose(lowest, 0.3, atol=1e-4)
 
 
 def test_too_few_points_have_no_support():
@@ -150,7 +199,7 @@ def test_the_ground_under_a_box_is_filled_with_the_table_colour():
 
 def _crop(splats: Splats, size: int) -> Crop:
     cameras = []
-    for eye in _CAMERAS:
+    for eye in _CENTERS:
         forward = (np.array([0.1, 0.1, 0.1]) - eye) / np.linalg.norm(np.array([0.1, 0.1, 0.1]) - eye)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
@@ -186,3 +235,28 @@ def test_a_template_is_found_where_it_stands_now():
     assert placement.overlap > 0.8
     assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(3)
     assert float(jnp.linalg.norm(placement.world_from_template.xyz - truth.xyz)) < 0.03 * 0.42
+
+
+def test_photographs_agree_on_the_surface_and_not_before_or_behind_it():
+    rng = np.random.default_rng(0)
+    texture = np.kron(rng.random((20, 20, 3)), np.ones((2, 2, 1)))  # cells of 5 cm on the plane z = 0, 2 m wide
+    size, focal = 160, 150.0
+    K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    cones, photographs = [], []
+    for center in np.array([[0.8, 0, 2.0], [-0.8, 0.3, 2.0], [0, -0.9, 2.0]]):
+        cam_from_world = np.linalg.inv(_looking(center, np.zeros(3)))[:3]
+        column, row = np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5)
+        rays = np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(K).T @ cam_from_world[:, :3]
+        hit = center + rays * (-center[2] / rays[..., 2])[..., None]
+        cell = np.clip(((hit[..., :2] + 1) / 2 * 40).astype(int), 0, 39)
+        photographs.append(texture[cell[..., 0], cell[..., 1]])
+        everywhere = np.ones((size, size), bool)
+        cones.append(Cone(K @ cam_from_world, everywhere, everywhere, np.full((size, size), 9.0)))
+    axis, heights = np.arange(-0.4, 0.4, 0.04), np.arange(-0.2, 0.21, 0.04)
+    grid = np.stack(np.meshgrid(axis, axis, heights, indexing="ij"), axis=-1)
+    solid = np.ones(grid.shape[:3], bool)
+    color, spread = surface_evidence(grid.reshape(-1, 3), solid, cones, photographs)
+    assert color.shape == (solid.size, 3)
+    by_height = np.median(spread.reshape(solid.shape), axis=(0, 1))
+    assert int(np.argmin(by_height)) == 5  # z = 0
+    assert by_height[5] < 0.5 * np.min(by_height[[0, 1, 2, 8, 9, 10]])

@@ -28,7 +28,7 @@ from ltgs_jax.template import (
 )
 
 from .config import Config
-from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats
+from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
@@ -79,9 +79,9 @@ def place_arrivals(
     did show what left. `surface`: points of the known scene.
     """
     arrivals = []
-    cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
+    vantage = vantage_of(observations)
     for instance in instances:
-        support = support_below(instance, surface, np.ones(len(surface)), cameras, rng=rng)
+        support = support_below(instance, surface, np.ones(len(surface)), vantage, rng=rng)
         if support is None:
             progress.note(f"visit {t}: a change seen in {instance.views} photographs has no surface below; left out")
             continue
@@ -100,7 +100,7 @@ def place_arrivals(
         if news[i] is None or news[i].gain < config.template.tau_new:
             continue
         shape = _same_shape(found, news[i], arrivals[i].crop)
-        if shape * found.likeness < config.template.tau_same:
+        if found.gain * found.likeness * shape < config.template.tau_same:
             identity = state.chronology.templates[k].identity
             progress.note(
                 f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f} only"

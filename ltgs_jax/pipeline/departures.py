@@ -10,7 +10,7 @@ from ltgs_jax.scene import Splats, Template, concatenate_splats
 from ltgs_jax.template import Removal, color_from_photographs, fill_under, find_removed, gone_evidence
 
 from .config import Config
-from .looks import Evidence, Eye, Observation, on_host, projection_of
+from .looks import Evidence, Eye, Observation, on_host, projection_of, vantage_of
 from .state import State, add_template, cut_background, extend_background, extend_template, next_identity, set_from
 
 
@@ -46,9 +46,14 @@ def take_out(
             gone[k] = float(share)
             state = set_from(state, t, k, visible=False)
     base = owner == 0
-    cameras = np.stack([np.asarray(o.camera.center(), np.float64) for o in observations])
     removals = find_removed(
-        splats[base], seen[:, base], told[:, base], cameras, pixels=pixels, rng=rng, config=config.template
+        splats[base],
+        seen[:, base],
+        told[:, base],
+        vantage_of(observations),
+        pixels=pixels,
+        rng=rng,
+        config=config.template,
     )
     return _cut_out(state, t, gone, removals, observations, config)
 
@@ -89,17 +94,17 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observatio
 
 
 def _torn_from(state: State, piece: Splats, gone, t: int) -> int | None:
-    """The template, cut out at this visit, that a smaller piece beside it belongs to."""
+    """The template, cut out at this visit, that a piece in or beside it, and no larger, belongs to."""
     means = np.asarray(piece.means)
     for k in gone:
         template = state.chronology.templates[k]
         if template.source_visit != 0 or bool(np.asarray(state.chronology.visible)[t:, k].any()):
             continue
         pose = state.chronology.world_from_template[t, k]
-        if np.abs(np.asarray(pose.xyz)).max() > 0 or piece.count > template.splats.count:
+        if np.abs(np.asarray(pose.xyz)).max() > 0:
             continue
         size = template_diameter(template.splats)
         distance = cKDTree(np.asarray(template.splats.means)).query(means)[0]
-        if np.median(distance) < 0.2 * size and np.linalg.norm(np.ptp(means, axis=0)) < size:
+        if np.median(distance) < 0.2 * size and template_diameter(piece) < 1.1 * size:
             return k
     return None

@@ -14,7 +14,7 @@ from ltgs_jax.geometry import Camera
 from ltgs_jax.match import Cone
 from ltgs_jax.render import RenderPlan, plan_render, render, splat_votes
 from ltgs_jax.scene import Splats
-from ltgs_jax.template import Refiner
+from ltgs_jax.template import Refiner, Vantage
 
 from .config import Config
 
@@ -152,6 +152,12 @@ def compare(
         for look, o in zip(looks, observations, strict=True)
     ]
     return Evidence(tuple(looks), tuple(changes))
+
+
+def vantage_of(observations: Sequence[Observation]) -> Vantage:
+    """Where the photographs were taken from."""
+    poses = [np.asarray(o.camera.cam_from_world.as_matrix(), np.float64) for o in observations]
+    return Vantage.of_cameras(np.linalg.inv(np.stack(poses)))
 
 
 def projection_of(camera: Camera) -> Float[np.ndarray, "3 4"]:

@@ -18,4 +18,5 @@ from .removal import Removal as Removal
 from .removal import find_removed as find_removed
 from .removal import gone_evidence as gone_evidence
 from .support import Support as Support
+from .support import Vantage as Vantage
 from .support import fit_support as fit_support

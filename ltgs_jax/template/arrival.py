@@ -14,13 +14,17 @@ from ltgs_jax.match import Cone, Instance, carve, grid_around
 from ltgs_jax.scene import Splats, Template
 
 from .config import TemplateConfig
+from .consistency import surface_evidence
 from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of
-from .support import Support, fit_support, rotation_about
+from .support import Support, Vantage, fit_support, rotation_about
+
+_AGREE = 0.06  # difference of colours at which two photographs hardly show one surface
 
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
-    its outlines that lies on the change, its structural likeness to the photographs, its outlines in the windows."""
+    its outlines that nothing speaks against, its structural likeness to the photographs, its outlines in the windows.
+    """
 
     world_from_template: SE3
     error: float
@@ -55,9 +59,11 @@ def pose_hypotheses(
     """Poses of a template (points in its frame, on `stood_on`) on another support around `place` (scene units).
 
     For each tilt and each of `turns` turns about the normal: the place itself and two rings of places around it, 0.35
-    and 0.8 `spread` wide; the lowest points touch the support.
+    and 0.8 `spread` wide. Upright, it keeps its height above what it stood on, of which the lowest points may say
+    little: no photograph shows them; tilted, the lowest points touch the support.
     """
-    center = np.median(template, axis=0)
+    center = np.quantile(template, [0.05, 0.95], axis=0).mean(axis=0)
+    stood = stood_on.height(center[None])[0]
     align = rotation_between(stood_on.normal, stands_on.normal)
     axes = stands_on.frame()
     ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
@@ -66,13 +72,13 @@ def pose_hypotheses(
     for tilt in tilts:
         for turn in range(turns):
             rotation = rotation_about(stands_on.normal, 2 * np.pi * turn / turns) @ align @ tilt
-            height = stands_on.height((template - center) @ rotation.T)
-            rest = place - stands_on.normal * (stands_on.height(place[None])[0])
-            lift = -(np.quantile(height, 0.02) + stands_on.offset) * stands_on.normal
+            upright = np.allclose(tilt, np.eye(3))
+            lift = stood if upright else -np.quantile((template - center) @ rotation.T @ stands_on.normal, 0.02)
+            rest = place + (lift - stands_on.height(place[None])[0]) * stands_on.normal
             for offset in offsets:
                 matrix = np.eye(4)
                 matrix[:3, :3] = rotation
-                matrix[:3, 3] = rest + offset + lift - rotation @ center
+                matrix[:3, 3] = rest + offset - rotation @ center
                 matrices.append(matrix)
     return SE3.from_matrix(jnp.asarray(np.stack(matrices), jnp.float32))
 
@@ -169,9 +175,9 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     pose = found.poses[int(np.argmin(found.errors))]
     images, cover = refiner.images(search.template, pose[None], crop, tolerance)
     error, gain = explained(images[0], crop)
-    covered = cover > 0.5
-    alike = likeness(images[0], cover[0], crop)
-    return Placement(pose, error, gain, float(overlap_of(covered, crop)[0]), alike, covered[0])
+    covered = cover[0] > 0.5
+    overlap, alike = overlap_of(images[0], covered, crop), likeness(images[0], cover[0], crop)
+    return Placement(pose, error, gain, overlap, alike, covered)
 
 
 def _unlike(
@@ -195,7 +201,7 @@ def support_below(
     instance: Instance,
     surface: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"],
-    cameras: Float[np.ndarray, "c 3"],
+    vantage: Vantage,
     *,
     rng: np.random.Generator,
 ) -> Support | None:
@@ -203,7 +209,7 @@ def support_below(
     center = np.median(instance.points, axis=0)
     radius = np.quantile(np.linalg.norm(instance.points - center, axis=1), 0.95) + 1e-9
     near = np.linalg.norm(surface - center, axis=1) < 2.5 * radius
-    return fit_support(surface[near], weights[near], instance.points, cameras, rng=rng)
+    return fit_support(surface[near], weights[near], instance.points, vantage, rng=rng)
 
 
 def build_template(
@@ -236,19 +242,15 @@ def build_template(
     if labels.max() == 0:
         return None
     largest = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
-    padded = np.pad(largest, 1)
-    boundary = (padded & ~ndimage.binary_erosion(padded))[1:-1, 1:-1, 1:-1]
-    normals = -np.stack(np.gradient(ndimage.gaussian_filter(padded.astype(float), 1.5)), axis=-1)[1:-1, 1:-1, 1:-1]
-    index = boundary.ravel()
-    points, normals = centers[index], normals.reshape(-1, 3)[index] @ frame
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9
-    if len(points) > config.new_splats:
-        keep = rng.choice(len(points), config.new_splats, replace=False)
-        points, normals = points[keep], normals[keep]
-    colors, seen = _colors(points, normals, outlines, photographs)
-    if not seen.any():
+    solid = largest.ravel()
+    colors, spread = surface_evidence(centers, largest, outlines, photographs)
+    if not np.isfinite(spread[solid]).any():
         return None
-    colors[~seen] = np.median(colors[seen], axis=0)
+    likely = np.where(solid, np.exp(-0.5 * (spread / _AGREE) ** 2), 0)
+    count = min(config.new_splats, int((likely > 0).sum()))
+    index = np.sort(rng.choice(len(centers), count, replace=False, p=likely / likely.sum()))
+    points, colors = centers[index], colors[index]
+    spacing = (solid.sum() / count) ** (1 / 3) * grid.voxel
     n = len(points)
     sh = np.zeros((n, coefficients, 3), np.float32)
     sh[:, 0] = (colors - 0.5) / C0
@@ -256,30 +258,8 @@ def build_template(
     splats = Splats(
         means=jnp.asarray(points, jnp.float32),
         quats=jnp.tile(quat_from_rotmat(jnp.eye(3, dtype=jnp.float32)), (n, 1)),
-        log_scales=jnp.full((n, 3), np.log(0.7 * grid.voxel), jnp.float32),
+        log_scales=jnp.full((n, 3), np.log(0.7 * spacing), jnp.float32),
         logit_opacities=jnp.full(n, logit, jnp.float32),
         sh=jnp.asarray(sh),
     )
     return Template(splats, identity, visit)
-
-
-def _colors(points, normals, cones: Sequence[Cone], photographs) -> tuple[np.ndarray, np.ndarray]:
-    """Colour of each point from the photograph that looks at it most squarely, and whether any does."""
-    colors = np.zeros((len(points), 3))
-    best = np.full(len(points), 0.05)
-    homogeneous = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    for cone, photograph in zip(cones, photographs, strict=True):
-        left = cone.projection[:, :3]
-        center = -np.linalg.solve(left, cone.projection[:, 3])
-        view = center - points
-        facing = np.sum(view * normals, axis=1) / np.linalg.norm(view, axis=1)
-        x, y, z = (homogeneous @ cone.projection.T).T
-        column = np.floor(x / np.maximum(z, 1e-6)).astype(int)
-        row = np.floor(y / np.maximum(z, 1e-6)).astype(int)
-        h, w = cone.silhouette.shape
-        inside = (z > 1e-6) & (column >= 0) & (column < w) & (row >= 0) & (row < h)
-        inside[inside] &= cone.silhouette[row[inside], column[inside]]
-        better = inside & (facing > best)
-        colors[better] = photograph[row[better], column[better]]
-        best[better] = facing[better]
-    return colors, best > 0.05

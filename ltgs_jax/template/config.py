@@ -47,8 +47,8 @@ class TemplateConfig:
     """Structural likeness to the photographs, in the middle view, from which on a known template is what came."""
     tau_remains: float = 0.35
     """Share of the change that may still be seen where a known template is put, for it to be what came."""
-    tau_same: float = 0.35
-    """Structural likeness times least overlap (IoU), over views, with the outlines of the change as a new object, from
-    which on a known template is what came."""
+    tau_same: float = 0.11
+    """Share of the change explained, times structural likeness, times least overlap (IoU) over views with the outlines
+    of the change as a new object, from which on a known template is what came."""
     tau_outline: float = 0.75
-    """Least share of a known template's outlines that lies on what changed."""
+    """Least share of a known template's outlines that nothing in the photographs speaks against."""

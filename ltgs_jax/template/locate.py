@@ -123,6 +123,7 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
 
 
 _FEW, _BATCH = 14, 64  # poses rendered in one call: of a descent (two with their probes), of a search
+_AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 
 
@@ -211,11 +212,19 @@ def _composites(template: Splats, poses: SE3, crop: Crop, tolerance, plan: Rende
     return image + (1 - cover)[..., None] * crop.backdrop, cover, out.overflow
 
 
-def overlap_of(covered: Bool[np.ndarray, "m v s s"], crop: Crop) -> Float[np.ndarray, " m"]:
-    """Share of the outlines that lies on what changed, pooled over the views that have a region."""
+def overlap_of(images: Float[np.ndarray, "v s s 3"], covered: Bool[np.ndarray, "v s s"], crop: Crop) -> float:
+    """Share of a template's outlines that nothing speaks against: they lie on what changed, or look no less like the
+    photographs than without it. Pooled over the views that have a region; `images` are composites with it."""
     region, valid = np.asarray(crop.region), np.asarray(crop.valid)
-    used = valid & region.any(axis=(1, 2), keepdims=True)
-    return np.sum(covered & region & used, axis=(1, 2, 3)) / np.maximum(np.sum(covered & used, axis=(1, 2, 3)), 1)
+    fits = region | (_unlike_crop(images[None], crop)[0] < backdrop_unlikeness(crop) + _AS_GOOD)
+    used = covered & valid & region.any(axis=(1, 2), keepdims=True)
+    return float(np.sum(used & fits) / max(np.sum(used), 1))
+
+
+def _middle(template: Splats) -> SE3:
+    """The shift from the template's origin to the middle of what shows of it."""
+    means = np.asarray(template.means)[np.asarray(template.opacities) > 0.1]
+    return SE3(jnp.asarray([1.0, 0, 0, 0], jnp.float32), jnp.asarray(np.median(means, axis=0), jnp.float32))
 
 
 def _slid(pose, center, shift, normal, angle):
@@ -229,11 +238,10 @@ def _slid(pose, center, shift, normal, angle):
 
 
 class Refinement(eqx.Module):
-    """Poses after descent, the mean unlikeness of each, and the share of its outlines that lies on what changed."""
+    """Poses after descent and the mean unlikeness of each."""
 
     poses: SE3
     errors: Float[np.ndarray, " m"]
-    overlaps: Float[np.ndarray, " m"]
 
 
 class Refiner:
@@ -292,7 +300,7 @@ class Refiner:
         Two in-plane shifts and a turn: the other three freedoms would let a wrong pose sink or tilt to please.
         """
         m = poses.xyz.shape[0]
-        center = np.median(np.asarray(template.means)[np.asarray(template.opacities) > 0.1], axis=0)
+        center = np.asarray(_middle(template).xyz, np.float64)
         axes = np.linalg.svd(normal[None])[2][1:]
         best, best_errors = np.asarray(poses.as_matrix(), np.float64), np.full(m, np.inf)
         tries = _BATCH // m
@@ -325,10 +333,16 @@ class Refiner:
         probes = np.concatenate([np.zeros((1, 6)), np.diag(delta)])
         damping = np.full(m, 1e-2)
         best = jax.tree.map(np.asarray, poses)
-        best_cost, best_errors, best_overlaps = np.full(m, np.inf), np.full(m, np.inf), np.zeros(m)
+        best_cost, best_errors = np.full(m, np.inf), np.full(m, np.inf)
         normal = np.zeros((m, 6, 6))
         slope = np.zeros((m, 6))
         trial = poses
+        middle = _middle(template)
+
+        def moved(poses: SE3, tangents: np.ndarray) -> SE3:
+            # About the template's middle: about a far origin, turns and shifts would be one and the same.
+            return poses @ middle @ SE3.exp(jnp.asarray(tangents, jnp.float32)) @ middle.inverse()
+
         valid = np.asarray(crop.valid)[None, None, ..., None]
         target = np.asarray(crop.target)
         for step in range(steps):
@@ -336,11 +350,10 @@ class Refiner:
                 best_cost[:] = np.inf
             blur = 1.5 if step < blurred else 0.0
             spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), 7, axis=0), trial)
-            spread = spread @ SE3.exp(jnp.asarray(np.tile(probes, (m, 1)), jnp.float32))
-            images, cover = self.images(template, spread, crop, tolerance)
+            spread = moved(spread, np.tile(probes, (m, 1)))
+            images, _ = self.images(template, spread, crop, tolerance)
             images = images.reshape(m, 7, *images.shape[1:])
             errors = _view_errors(_unlike_crop(images[:, 0], crop), crop).mean(axis=1)
-            overlaps = overlap_of(cover.reshape(m, 7, *cover.shape[1:])[:, 0] > 0.5, crop)
             residual = (images - target) * valid
             # Colours for where it stands; what is left of the greys without their local mean for the rest: that
             # stays when the object is shaded otherwise.
@@ -366,7 +379,6 @@ class Refiner:
                 best,
             )
             best_cost, best_errors = np.where(better, cost, best_cost), np.where(better, errors, best_errors)
-            best_overlaps = np.where(better, overlaps, best_overlaps)
             scale = np.einsum("mii->mi", normal)
             scale = scale + 1e-9 * scale.max(axis=1, keepdims=True) + 1e-12
             system = normal + (damping[:, None] * scale)[:, :, None] * np.eye(6)
@@ -374,5 +386,5 @@ class Refiner:
             # No step leaves the region in which a linearisation of pixels can mean anything.
             move[:, :3] = np.clip(move[:, :3], -0.15 * size, 0.15 * size)
             move[:, 3:] = np.clip(move[:, 3:], -0.3, 0.3)
-            trial = jax.tree.map(jnp.asarray, best) @ SE3.exp(jnp.asarray(move, jnp.float32))
-        return Refinement(jax.tree.map(jnp.asarray, best), best_errors, best_overlaps)
+            trial = moved(jax.tree.map(jnp.asarray, best), move)
+        return Refinement(jax.tree.map(jnp.asarray, best), best_errors)

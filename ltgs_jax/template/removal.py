@@ -10,7 +10,7 @@ from ltgs_jax.scene import Splats
 
 from .config import TemplateConfig
 from .cut import components, neighbour_graph, random_walk
-from .support import Support, convex_footprint, fit_support
+from .support import Support, Vantage, convex_footprint, fit_support
 
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
@@ -44,7 +44,7 @@ def find_removed(
     splats: Splats,
     seen: Float[np.ndarray, "v n"],
     evidence: Float[np.ndarray, "v n"],
-    cameras: Float[np.ndarray, "v 3"],
+    vantage: Vantage,
     *,
     pixels: int,
     rng: np.random.Generator,
@@ -68,7 +68,7 @@ def find_removed(
         group = group[~taken[group]]
         if left[group].sum() < least:
             continue
-        for members, support in _solids(splats, colors, group, left, stayed, cameras, rng, config):
+        for members, support in _solids(splats, colors, group, left, stayed, vantage, rng, config):
             members = members & ~taken
             votes = float(left[members].sum())
             views = int(np.sum(changed[:, members].sum(axis=1) >= least))
@@ -136,14 +136,14 @@ def _parts(splats, colors, height, local, body, floor, axes, left, stayed, confi
     return [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
 
 
-def _solids(splats: Splats, colors, group, left, stayed, cameras, rng, config: TemplateConfig):
+def _solids(splats: Splats, colors, group, left, stayed, vantage, rng, config: TemplateConfig):
     """The solid things in one group: masks of splats, with what is under them on the surface they stand on."""
     means = np.asarray(splats.means, np.float64)
     center = np.median(means[group], axis=0)
     radius = np.linalg.norm(means[group] - center, axis=1).max() + 1e-9
     near = np.linalg.norm(means - center, axis=1) < 3 * radius
     ground = near & (stayed > 0.5)
-    support = fit_support(means[ground], np.minimum(stayed[ground], 5) + 1e-3, means[group], cameras, rng=rng)
+    support = fit_support(means[ground], np.minimum(stayed[ground], 5) + 1e-3, means[group], vantage, rng=rng)
     if support is None:
         members = np.zeros(len(means), bool)
         members[group] = True

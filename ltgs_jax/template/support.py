@@ -5,6 +5,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
+_STEEP = 0.02  # what a steep plane counts for beside a level one: things hang on walls, but rarely
+_LEVEL = np.radians(15)  # by which a surface that things stand on, or the guess of what is up, may be off
+
 
 class Support(eqx.Module):
     """A plane normal·x = offset, its normal towards the cameras, with the residual noise of its points."""
@@ -25,6 +28,24 @@ class Support(eqx.Module):
         return np.stack([u, np.cross(self.normal, u), self.normal])  # right-handed
 
 
+class Vantage(eqx.Module):
+    """Where a visit's photographs were taken from: camera centres, and which way is up, as a unit vector."""
+
+    centers: Float[np.ndarray, "c 3"]
+    up: Float[np.ndarray, "3"]
+
+    @classmethod
+    def of_cameras(cls, world_from_cam: Float[np.ndarray, "c 4 4"]) -> "Vantage":
+        """Up is what is level in all photographs, held upright: square to the cameras' x axes; from cameras side by
+        side, that come near to one such axis, near to the mean of their own up."""
+        right, own = world_from_cam[:, :3, 0], -world_from_cam[:, :3, 1]
+        mean = own.mean(axis=0)
+        mean /= np.linalg.norm(mean) + 1e-12
+        spread = right.T @ right / len(right) + 0.1 * (np.eye(3) - np.outer(mean, mean))
+        up = np.linalg.eigh(spread)[1][:, 0]
+        return cls(world_from_cam[:, :3, 3], up if up @ mean >= 0 else -up)
+
+
 def rotation_about(axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3 3"]:
     """Rotation by an angle in radians about a unit axis (Rodrigues)."""
     skew = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -35,7 +56,7 @@ def fit_support(
     points: Float[np.ndarray, "n 3"],
     weights: Float[np.ndarray, " n"],
     above: Float[np.ndarray, "m 3"],
-    cameras: Float[np.ndarray, "c 3"],
+    vantage: Vantage,
     *,
     rng: np.random.Generator,
     trials: int = 400,
@@ -44,14 +65,14 @@ def fit_support(
 
     RANSAC with a truncated loss whose bound is 2.5 % of the points' spread, then least squares on the inliers. A plane
     must have the object on its upper side and in touch with it, so that a wall behind it does not win over the table
-    below.
+    below; a level one is likelier than a steep one.
     """
     if len(points) < 12:
         return None
     center = np.average(points, axis=0, weights=weights)
     spread = np.sqrt(np.average(np.sum((points - center) ** 2, axis=1), weights=weights))
     bound = 0.025 * spread
-    reach = 0.1 * np.linalg.norm(np.ptp(above, axis=0)) + 2 * bound
+    reach = 0.2 * np.linalg.norm(np.ptp(above, axis=0)) + 2 * bound
     probability = weights / weights.sum()
     best_score, best = 0.0, None
     for _ in range(trials):
@@ -61,14 +82,16 @@ def fit_support(
         if length < 1e-9 * spread**2:
             continue
         normal /= length
-        if np.median((cameras - a) @ normal) < 0:
+        if np.median((vantage.centers - a) @ normal) < 0:
             normal = -normal
         distance = (points - a) @ normal
         inlier = np.sum(weights * np.maximum(0, 1 - (distance / bound) ** 2))
         height = (above - a) @ normal
         over = np.mean(height > -reach)
         touch = np.exp(-0.5 * (np.quantile(height, 0.05) / reach) ** 2)
-        score = inlier * over**2 * touch
+        angle = np.arccos(np.clip(normal @ vantage.up, -1, 1))
+        level = max(_STEEP, np.exp(-0.5 * (angle / _LEVEL) ** 2))
+        score = inlier * over**2 * touch * level
         if score > best_score:
             best_score, best = score, (normal, a)
     if best is None:
