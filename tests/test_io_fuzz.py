@@ -10,6 +10,7 @@ import re
 import resource
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -18,7 +19,13 @@ import numpy as np
 import pytest
 
 from ltgs_jax import io
+from ltgs_jax.features import FromDisk, name_images
 from ltgs_jax.io import load_chronology, read_capture, read_colmap, read_splats
+from ltgs_jax.pipeline.outputs import read_cameras
+from ltgs_jax.pipeline.store import Store
+from ltgs_jax.report.page import page
+from ltgs_jax.report.run import read_run
+from ltgs_jax.report.shots import make_gallery
 from ltgs_jax.scene import Chronology, Splats
 
 SECONDS = 2.0
@@ -84,6 +91,80 @@ def _transforms(folder: Path) -> None:
     (folder / "transforms.json").write_text(json.dumps(content))
 
 
+def _mask(folder: Path) -> None:
+    _capture(folder, ".png")
+    io.write_labels(folder / "masks" / "IMG_0000" / "001.png", np.eye(24, 32, dtype=int))
+
+
+def _folder_of_a_phone(folder: Path) -> None:
+    from test_io_intake import _photograph
+
+    _photograph(folder / "visit" / "a.jpg", orientation=6, equivalent=27)
+    io.write_image(folder / "masks" / "visit.png", np.ones((24, 40, 3)))
+
+
+def _bring_in(folder: Path) -> None:
+    with tempfile.TemporaryDirectory() as out:
+        for photograph in io.sharpest(io.find_intake(folder)[0]["visit"], 1):
+            upright = io.bring_in(photograph, Path(out) / "images", max_side=16)
+            io.bring_mask(photograph, upright, Path(out) / "masks")
+
+
+def _run(folder: Path) -> None:
+    """The small files of a finished run."""
+    pose = {"wxyz": [1, 0, 0, 0], "xyz": [0, 0, 2]}
+    state = {"visit": 1, "event": "moved", "visible": True, "world_from_template": pose, "confidence": 0.5}
+    state |= {"inliers": 9, "residual": 0.1, "ambiguous_axis": None}
+    thing = {"id": 1, "source_visit": 0, "splats": 3, "center": [0, 0, 0], "size": 1.0, "states": [state]}
+    placed = {"name": "b/0.png", "status": "rejected", "inliers": 3, "reason": "too few"}
+    io.write_tracks(folder / "tracks.json", visits=["a", "b"], photographs=[placed], objects=[thing])
+    camera = {"K": [[8, 0, 4], [0, 8, 3], [0, 0, 1]], "width": 8, "height": 6, "cam_from_world": pose}
+    camera |= {"visit": 1, "role": "update"}
+    shown = {"name": "b/0.png", "visit": "b", "role": "update", "psnr": 20.5, "capture_path": "b.png"}
+    row = {"key": "psnr", "visit": "b", "region": "full", "value": 20.5, "unit": "dB", "direction": "higher"}
+    stage = {"stage": "fit", "seconds": 1.5, "compile_seconds": 0.5, "peak_bytes": 9, "status": "done"}
+    io.write_image(folder / "b.png", np.zeros((6, 8, 3)))
+    io.write_json(folder / "cameras.json", {"capture": "/nowhere", "photographs": {"b/0.png": camera}})
+    io.write_json(folder / "report.json", {"photographs": [shown]})
+    io.write_json(folder / "metrics.json", [row])
+    io.write_json(folder / "stages.json", [{**stage, "counts": {"masks": 4}}])
+
+
+def _look_at(folder: Path) -> None:
+    """All that a page of results is made of, and cameras for rendering and scoring."""
+    run = read_run(folder)
+    page(run, make_gallery(run), {})
+    io.read_tracks(folder / "tracks.json")
+    read_cameras(folder)
+
+
+def _features(folder: Path) -> None:
+    rng = np.random.default_rng(0)
+    arrays = {"features": rng.normal(size=(3, 4, 5)), "stride": np.array(2), "labels": np.eye(6, 8, dtype=int)}
+    keypoints = {"xy": rng.uniform(0, 6, (9, 2)), "descriptors": rng.normal(size=(9, 8))}
+    np.savez_compressed(folder / "a.npz", **arrays, **keypoints)
+
+
+def _read_features(folder: Path) -> None:
+    image = np.zeros((6, 8, 3), np.float32)
+    front_end = FromDisk(folder, name_images([("a", image)]))
+    for ask in (front_end.describe, front_end.propose, front_end.keypoints):
+        try:
+            ask(image)
+        except ValueError as error:  # the room's own word for a wrong file: it does not know `io`
+            raise io.InputError(str(error)) from error
+
+
+def _stage(folder: Path) -> None:
+    Store(folder, _Silent()).run("fit", "key", lambda: ({"a": np.arange(5.0)}, {"counts": {"splats": 5}}))
+
+
+class _Silent:
+    def stage(self, name): ...
+
+    def note(self, text): ...
+
+
 def _split(folder: Path) -> None:
     for i in range(2):
         io.write_image(folder / "images" / f"{i}.png", np.zeros((6, 8, 3)))
@@ -116,6 +197,15 @@ KINDS = {
         lambda f: io.save_chronology(f, Chronology.of_initial(_splats(), ("a", "b"))),
         load_chronology,
     ),
+    "mask": ("masks/IMG_0000/001.png", _mask, _load_everything),
+    "photograph of a phone": ("visit/a.jpg", _folder_of_a_phone, _bring_in),
+    "mask of a phone": ("masks/visit.png", _folder_of_a_phone, _bring_in),
+    **{
+        f"{name}.json": (f"{name}.json", _run, _look_at)
+        for name in ("tracks", "cameras", "report", "metrics", "stages")
+    },
+    "features.npz": ("a.npz", _features, _read_features),
+    "stage": ("stages/fit.safetensors", _stage, _stage),
     **{
         f"photograph{suffix}": (f"images/IMG_0000/001{suffix}", lambda f, s=suffix: _capture(f, s), _load_everything)
         for suffix in (".png", ".jpg", ".tif", ".webp", ".bmp", ".ppm")
@@ -202,6 +292,13 @@ def test_damaged_files(tmp_path, kind):
 
 def test_damaged_photographs(tmp_path):
     _in_a_process([kind for kind in KINDS if kind.startswith("photograph")], tmp_path, 20)
+
+
+def test_features_that_unpack_beyond_measure_are_refused(tmp_path, monkeypatch):
+    _features(tmp_path)
+    monkeypatch.setattr("ltgs_jax.features.disk._MOST_BYTES", 1000)
+    with pytest.raises(io.InputError, match=r"a\.npz: .*unpacked it has more than"):
+        _read_features(tmp_path)
 
 
 @pytest.mark.slow

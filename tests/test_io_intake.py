@@ -5,7 +5,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from ltgs_jax.io import InputError, bring_in, find_intake, read_pixels, sharpest
+from ltgs_jax.io import InputError, bring_in, bring_mask, find_intake, read_pixels, sharpest, write_image
 from ltgs_jax.io.images import read_header
 
 
@@ -96,3 +96,27 @@ def test_of_a_video_s_frames_the_sharpest_of_each_stretch_are_kept(tmp_path):
     frames = find_intake(tmp_path)[0]["v"]
     assert [p.name for p in sharpest(frames, 4)] == [f"v/{i:03d}.png" for i in (1, 5, 8, 10)]
     assert sharpest(frames, 12) == frames
+
+
+@pytest.mark.parametrize("place", ["visit/a.jpg.png", "visit/a.png", "visit.png"])
+def test_masks_come_along_upright_and_reduced(tmp_path, place):
+    _photograph(tmp_path / "in" / "visit" / "a.jpg", width=80, height=40, orientation=6)
+    mask = np.ones((40, 80, 3), np.float32)
+    mask[30:, 10:50] = 0
+    write_image(tmp_path / "in" / "masks" / place, mask)
+    found, remarks = find_intake(tmp_path / "in")
+    assert list(found) == ["visit"] and not remarks, "masks are no visit"
+    upright = bring_in(found["visit"][0], tmp_path / "images", max_side=40)
+    bring_mask(found["visit"][0], upright, tmp_path / "masks")
+    brought = read_pixels(tmp_path / "masks" / "visit" / "a.jpg.png")[..., 0]
+    assert brought.shape == (20, 40)
+    np.testing.assert_array_equal(brought == 0, (mask[1::2, ::2, 0] == 0))
+
+
+def test_a_mask_of_another_shape_is_named(tmp_path):
+    _photograph(tmp_path / "in" / "visit" / "a.jpg")
+    write_image(tmp_path / "in" / "masks" / "visit.png", np.ones((40, 24, 3), np.float32))
+    (photograph,) = find_intake(tmp_path / "in")[0]["visit"]
+    upright = bring_in(photograph, tmp_path / "images", max_side=None)
+    with pytest.raises(InputError, match=r"visit\.png: is 24×40, its photograph 40×24"):
+        bring_mask(photograph, upright, tmp_path / "masks")

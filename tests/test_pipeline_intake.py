@@ -1,16 +1,19 @@
 """From a folder of photographs to a capture with the cameras of all visits."""
 
+import zlib  # noqa: F401, I001  (before pycolmap, whose own zlib otherwise takes over the process and aborts it)
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 
 from ltgs_jax.demo import make_capture as make_demo_capture
 from ltgs_jax.io import InputError, Upright, read_capture, read_json, write_image, write_json
 from ltgs_jax.localize import StructureConfig, choose_pairs
+from ltgs_jax.localize.structure import _extract as extract_keypoints
 from ltgs_jax.pipeline import IntakeConfig, make_capture
 from ltgs_jax.pipeline.hold import only_run
 
@@ -46,6 +49,24 @@ def test_pairs_reach_neighbours_and_look_alikes_only_once(tmp_path):
     assert all(i + 20 in pairs[i] and i + 1 in pairs[i] for i in range(19))
     assert all(j > i for i, others in enumerate(pairs) for j in others)
     assert sum(map(len, pairs)) <= 40 * 3
+
+
+def test_no_keypoint_is_taken_where_the_mask_is_zero(tmp_path):
+    """What stands still in the picture while the camera moves would bend the whole structure."""
+    photograph = Upright("v/a.png", 160, 120, None)
+    noise = np.random.default_rng(0).random((30, 40, 3)).astype(np.float32)
+    write_image(tmp_path / "images" / photograph.name, np.kron(noise, np.ones((4, 4, 1), np.float32)))
+    mask = np.ones((120, 160, 3), np.float32)
+    mask[60:] = 0
+    write_image(tmp_path / "masks" / "v" / "a.png.png", mask)
+    rows = {}
+    for masks in (None, tmp_path / "masks"):
+        database = tmp_path / f"{masks is None}.db"
+        extract_keypoints(tmp_path / "images", [photograph], database, masks, StructureConfig(), False, lambda *_: None)
+        with pycolmap.Database.open(database) as opened:
+            rows[masks is None] = opened.read_keypoints(1)[:, 1]
+    assert (rows[True] > 70).sum() > 20
+    assert len(rows[False]) > 20 and rows[False].max() <= 60
 
 
 def test_a_visit_that_cannot_be_a_first_one_is_refused(tmp_path):

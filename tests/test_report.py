@@ -1,5 +1,6 @@
 """The page of results, from a made-up chronology folder; looked at in Chromium where there is one."""
 
+import base64
 import json
 import re
 from html.parser import HTMLParser
@@ -13,6 +14,7 @@ from ltgs_jax.io import InputError
 from ltgs_jax.report import write_report
 from ltgs_jax.report.pictures import color_of, crop_box, difference, read_shown
 from ltgs_jax.report.run import read_run
+from ltgs_jax.report.shots import make_gallery
 from ltgs_jax.report.words import caution, counted, duration, happenings, movement, number, summary
 
 VISITS = ["before", "<after> & co", "later"]
@@ -308,3 +310,23 @@ def test_the_page_works_in_a_browser(chronology, tmp_path, window, scheme):
     assert found["wide"] == 0, "the page scrolls sideways"
     assert found["images"] == 0, "an image is broken"
     assert (found["dark"] == "rgb(21, 24, 28)") == (scheme == "dark")
+
+
+def test_an_object_that_no_mask_shows_is_cut_out_where_its_pose_puts_it(chronology):
+    """Object 2 of the fixture without masks: a camera that looks at its middle from 4 away sees it in the middle."""
+    manifest = json.loads((chronology / "report.json").read_text())
+    for entry in manifest["photographs"]:
+        entry.pop("mask_path")
+    (chronology / "report.json").write_text(json.dumps(manifest))
+    pose = {"wxyz": [1, 0, 0, 0], "xyz": [-1, 0, 4]}
+    placed = {"K": [[200, 0, 60], [0, 200, 45], [0, 0, 1]], "width": 120, "height": 90, "cam_from_world": pose}
+    cameras = {"capture": "/somewhere/kitchen", "photographs": {"before/0.png": placed}}
+    (chronology / "cameras.json").write_text(json.dumps(cameras))
+    run = read_run(chronology)
+    crops = make_gallery(run).crops
+    assert [crop.name for crop in crops[2]] == ["before/0.png"] and crops[2][0].render
+    content = base64.b64decode(crops[2][0].capture.split(",")[1])
+    assert cv2.imdecode(np.frombuffer(content, np.uint8), 1).shape == (30, 30, 3)  # 2 × 0.6 × 0.5 × 200 / 4
+    placed["cam_from_world"]["xyz"] = [-1, 0, -4]
+    (chronology / "cameras.json").write_text(json.dumps(cameras))
+    assert not make_gallery(read_run(chronology)).crops.get(2), "it lies behind"

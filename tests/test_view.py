@@ -171,8 +171,9 @@ def test_the_controls(viewer):
     assert green.visible
     plain = red.rgbs.copy()
     viewer.highlight(4)
-    assert not np.array_equal(red.rgbs, plain)
+    assert not np.array_equal(red.rgbs, plain) and viewer._chosen.value == "object 4"
     viewer.highlight(None)
+    assert viewer._chosen.value == "none"
     assert np.array_equal(red.rgbs, plain) and not viewer._labels
     viewer._show_frusta.value = True
     viewer._refresh()

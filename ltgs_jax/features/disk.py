@@ -13,6 +13,8 @@ from .classical import Classical
 from .keypoints import inside, match_descriptors
 from .protocol import Correspondences, Dense, FrontEnd, Image, Proposals, check_image, proposals_from_masks
 
+_MOST_BYTES = 400 << 20  # of one photograph's arrays, unpacked: a hundred masks of 2000×2000; zeros pack a thousandfold
+
 
 def name_images(images: Iterable[tuple[str, Image]]) -> tuple[tuple[str, str], ...]:
     """(content hash, name) of images, by which `FromDisk` knows whose arrays to read; the name is `<visit>/<file>`."""
@@ -104,9 +106,12 @@ class FromDisk:
             return {}
         try:
             with path.open("rb") as handle, np.load(handle) as file:
+                if sum(entry.file_size for entry in file.zip.infolist()) > _MOST_BYTES:
+                    raise ValueError(f"unpacked it has more than {_MOST_BYTES >> 20} MiB")
                 return {key: file[key] for key in file.files}
         except Exception as error:
-            raise ValueError(f"{path}: cannot be read as npz without pickle ({error})") from None
+            why = " ".join(str(error).split())
+            raise ValueError(f"{path}: cannot be read as npz without pickle ({why:.200})") from None
 
     def _arrays(self, image: Image) -> dict[str, np.ndarray]:
         name = dict(self.names).get(content_hash(check_image(image)))

@@ -28,6 +28,7 @@ from .images import write_labels as write_labels
 from .intake import Intake as Intake
 from .intake import Upright as Upright
 from .intake import bring_in as bring_in
+from .intake import bring_mask as bring_mask
 from .intake import find_intake as find_intake
 from .intake import sharpest as sharpest
 from .lens import CameraModel as CameraModel

@@ -94,13 +94,24 @@ def read_text(path: str | Path) -> str:
 
 
 def read_json(path: str | Path, expected: type = dict) -> Any:
-    """A JSON file whose outermost value is of type `expected`. Raises InputError that names it."""
+    """A JSON file whose outermost value is of type `expected`; NaN and infinities are not JSON, and refused.
+
+    Raises InputError that names it.
+    """
+    text = read_text(path)
     try:
-        value = json.loads(read_text(path))
-    except (json.JSONDecodeError, RecursionError) as error:
+        value = json.loads(text, parse_float=_finite, parse_constant=_finite)
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: is not JSON ({error})") from None
     if not isinstance(value, expected):
         raise InputError(f"{path}: expected a JSON {expected.__name__}, got {type(value).__name__}")
+    return value
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text:.20} is no number")
     return value
 
 

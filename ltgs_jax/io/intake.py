@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from .files import InputError, natural_key, replacing
-from .images import SUFFIXES, as_rgb, read_header, read_pixels, resize_image, scaled_size, write_pixels
+from .images import SUFFIXES, as_rgb, read_header, read_pixels, resize_image, resize_mask, scaled_size, write_pixels
 
 _VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 _REFUSED = (
@@ -27,15 +27,20 @@ _REFUSED = (
         "videos are not read; cut it into frames first, e.g. `mkdir visit && ffmpeg -i {0} -vf fps=2 visit/%04d.jpg`",
     ),
 )
+_MASKS = "masks"
 _SHARPNESS_SIDE = 480  # pixels at which blur by a moving hand is still seen and grain is not
 
 
 @dataclasses.dataclass(frozen=True)
 class Intake:
-    """One photograph on its way into a capture: where it lies, `<visit>/<file>` as it will be called."""
+    """One photograph on its way into a capture: where it lies, `<visit>/<file>` as it will be called.
+
+    `mask` says what to ignore in it, 0 = ignore, in an image as large as the photograph is upright; None: nothing.
+    """
 
     source: Path
     name: str
+    mask: Path | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +57,10 @@ def find_intake(folder: str | Path, *, order: Sequence[str] = ()) -> tuple[dict[
     """The photographs of each visit of a plain folder, and remarks: one sub-folder per visit, or photographs alone.
 
     Visits in natural order of their names, or in `order`. Visits and files are renamed where a COLMAP model or a
-    capture could not hold their names. Raises InputError that names the folder or file: no photographs, formats that
-    are not read (with the way to convert them), an `order` that does not name the visits.
+    capture could not hold their names. Masks are looked for as `masks/<visit>/<file>.png`, with or without the suffix
+    of the photograph before `.png`, and as `masks/<visit>.png` for a whole visit. Raises InputError that names the
+    folder or file: no photographs, formats that are not read (with the way to convert them), an `order` that does not
+    name the visits.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -74,7 +81,7 @@ def find_intake(folder: str | Path, *, order: Sequence[str] = ()) -> tuple[dict[
 
 
 def _shown(path: Path) -> bool:
-    return path.is_dir() and not path.name.startswith(".")
+    return path.is_dir() and not path.name.startswith(".") and path.name != _MASKS
 
 
 def _photographs(folder: Path) -> list[Path]:
@@ -109,8 +116,14 @@ def _named(visit: str, files: Sequence[Path]) -> list[Intake]:
             number += 1
             stem = f"{_plain(path.stem)}_{number}"
         taken.add(stem.lower())
-        named.append(Intake(path, f"{visit}/{stem}{path.suffix.lower()}"))
+        named.append(Intake(path, f"{visit}/{stem}{path.suffix.lower()}", _mask_of(path)))
     return named
+
+
+def _mask_of(path: Path) -> Path | None:
+    visit = path.parent.parent / _MASKS / path.parent.name
+    choices = (visit / f"{path.name}.png", visit / f"{path.stem}.png", visit.with_name(f"{visit.name}.png"))
+    return next((choice for choice in choices if choice.is_file()), None)
 
 
 def _plain(name: str) -> str:
@@ -159,3 +172,19 @@ def bring_in(photograph: Intake, images: Path, *, max_side: int | None) -> Uprig
             write_pixels(target, resize_image(pixels, size))
     focal = None if header.focal is None else header.focal * max(size) / max(upright)
     return Upright(photograph.name, *size, focal)
+
+
+def bring_mask(photograph: Intake, upright: Upright, masks: Path) -> None:
+    """Put the mask of a photograph, if it has one, beside it as `masks/<visit>/<file>.<suffix>.png`, COLMAP's habit.
+
+    Raises InputError that names the mask when it is no image or has another shape than the photograph set upright.
+    """
+    if photograph.mask is None:
+        return
+    pixels = as_rgb(read_pixels(photograph.mask))
+    height, width = pixels.shape[:2]
+    if abs(width * upright.height - height * upright.width) > max(width, height, upright.width, upright.height):
+        shape = f"{width}×{height}"
+        raise InputError(f"{photograph.mask}: is {shape}, its photograph {upright.width}×{upright.height}")
+    mask = resize_mask(pixels.max(axis=-1) > 0, (upright.width, upright.height))
+    write_pixels(masks / f"{photograph.name}.png", (255 * mask).astype(np.uint8))

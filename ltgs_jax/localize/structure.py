@@ -60,19 +60,20 @@ def reconstruct(
     photographs: Sequence[Upright],
     work: Path,
     *,
+    masks: Path | None = None,
     config: StructureConfig = StructureConfig(),
     progress: Progress = lambda what, done, total: None,
 ) -> Structure:
     """Cameras and points of photographs that show one scene from many sides (Schönberger & Frahm 2016, by pycolmap).
 
     Photographs of one size and EXIF focal length share a camera. `work` keeps keypoints and matches: called again, it
-    goes on from there. The frame is COLMAP's own, its scale arbitrary. Raises InputError that names `images` when no
-    two photographs hang together.
+    goes on from there. `masks` may hold `<name>.png` of each photograph: no keypoint is taken where it is 0. The frame
+    is COLMAP's own, its scale arbitrary. Raises InputError that names `images` when no two photographs hang together.
     """
     careful = [True] if len(photographs) <= config.few else [False, True]
     best: Structure | None = None
     for care in careful:
-        found = _attempt(images, photographs, work / ("careful" if care else "plain"), config, care, progress)
+        found = _attempt(images, photographs, work / ("careful" if care else "plain"), masks, config, care, progress)
         if found is not None and (best is None or len(found.left) < len(best.left)):
             best = found
         if best is not None and len(best.model.images) >= config.enough * len(photographs):
@@ -85,20 +86,20 @@ def reconstruct(
     return best
 
 
-def _attempt(images, photographs, work: Path, config: StructureConfig, care: bool, progress) -> Structure | None:
+def _attempt(images, photographs, work, masks, config: StructureConfig, care: bool, progress) -> Structure | None:
     """One go; None when nothing came of it."""
     work.mkdir(parents=True, exist_ok=True)
     database = work / "database.db"
     level, pycolmap.logging.minloglevel = pycolmap.logging.minloglevel, 3  # what fails is told in our own words
     try:
-        _extract(images, photographs, database, config, care, progress)
+        _extract(images, photographs, database, masks, config, care, progress)
         _match(images, photographs, database, config, care, progress)
         return _map(images, photographs, database, work / "models", care, progress)
     finally:
         pycolmap.logging.minloglevel = level
 
 
-def _extract(images, photographs, database: Path, config: StructureConfig, care: bool, progress) -> None:
+def _extract(images, photographs, database: Path, masks, config: StructureConfig, care: bool, progress) -> None:
     """Keypoints of each photograph, one camera for those of one size and focal length."""
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu = False
@@ -110,6 +111,8 @@ def _extract(images, photographs, database: Path, config: StructureConfig, care:
         progress("keypoints", i, len(photographs))
         reader = pycolmap.ImageReaderOptions()
         reader.camera_model = _MODEL
+        if masks is not None and (masks / f"{p.name}.png").is_file():
+            reader.mask_path = masks
         kind = (p.width, p.height, p.focal)
         if kind in cameras:
             reader.existing_camera_id = cameras[kind]

@@ -9,6 +9,7 @@ from ltgs_jax.io import (
     InputError,
     Upright,
     bring_in,
+    bring_mask,
     export_colmap,
     find_intake,
     read_capture,
@@ -62,6 +63,7 @@ def make_capture(
         "visits": list(found),
         "options": asdict(config),
         "files": [[p.name, str(p.source), p.source.stat().st_mtime_ns] for files in found.values() for p in files],
+        "masks": [[str(m), m.stat().st_mtime_ns] for files in found.values() for p in files if (m := p.mask)],
     }
     if (out / RECORD).is_file():
         record = read_json(out / RECORD)
@@ -90,7 +92,7 @@ def _start_over_when_other(making: Path, plan: dict) -> None:
     """Empty the folder unless an interrupted run of the same plan left it."""
     path = making / "plan.json"
     if not path.is_file() or read_json(path).get("digest") != digest(plan):
-        for name in ("images", "sparse", "work"):
+        for name in ("images", "masks", "sparse", "work"):
             shutil.rmtree(making / name, ignore_errors=True)
         write_json(path, {"digest": digest(plan)})
 
@@ -110,6 +112,7 @@ def _make(making: Path, found: dict, config: IntakeConfig, progress) -> dict:
         making / "images",
         brought[first],
         making / "work",
+        masks=making / "masks",
         config=config.structure,
         progress=lambda what, done, total: progress.step(done, total, what),
     )
@@ -156,6 +159,7 @@ def _bring_all(images: Path, found: dict, config: IntakeConfig, rows: dict, prog
                 continue
             try:
                 upright = bring_in(photograph, images, max_side=config.max_side or None)
+                bring_mask(photograph, upright, images.with_name("masks"))
             except InputError as error:
                 progress.warn(str(error))
                 rows[photograph.name] = row | {"status": "rejected", "reason": str(error)}

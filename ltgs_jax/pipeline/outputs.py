@@ -137,7 +137,7 @@ def read_cameras(out: Path) -> tuple[Path, dict[str, tuple[int, str, Camera]]]:
             for name, entry in content["photographs"].items()
         }
         return Path(content["capture"]), cameras
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: is not a list of cameras ({error})") from None
 
 

@@ -98,7 +98,7 @@ def _read(path: Path, key: str) -> tuple[dict[str, np.ndarray], dict] | None:
         if metadata["key"] != key:
             return None
         return arrays, {"notes": json.loads(metadata["notes"]), "row": json.loads(metadata["row"])}
-    except (SafetensorError, ValueError, KeyError):
+    except (SafetensorError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

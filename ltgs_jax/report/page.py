@@ -182,7 +182,10 @@ def _scores(rows: Sequence[dict]) -> str:
 
 
 def _number(value: Any) -> float | None:
-    return float(value) if isinstance(value, int | float) else None
+    try:
+        return float(value) if isinstance(value, int | float) else None
+    except OverflowError:  # JSON has integers beyond any float
+        return None
 
 
 def _stages(rows: Sequence[dict]) -> str:

@@ -10,6 +10,9 @@ import jax.numpy as jnp
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, read_json
 
+_FAULTS = (KeyError, TypeError, ValueError, AttributeError, OverflowError, IndexError)
+"""What reading values of the wrong kind raises."""
+
 CHANGES = ("added", "removed", "moved", "new_state")
 
 
@@ -101,21 +104,25 @@ def read_run(folder: Path) -> Run:
         visits = tuple(str(visit) for visit in tracks["visits"])
         objects = tuple(_object(entry) for entry in tracks["objects"])
         placements = tuple(
-            Placement(entry["name"], entry["status"], entry.get("inliers"), entry.get("reason"))
+            Placement(
+                str(entry["name"]), str(entry["status"]), _whole(entry.get("inliers")), _text(entry.get("reason"))
+            )
             for entry in tracks.get("photographs", [])
         )
         if any(not 0 <= visit < len(visits) for entry in objects for visit in (entry.source_visit, *entry.states)):
             raise ValueError("a visit beyond the list of visits")
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except _FAULTS as error:
         raise InputError(f"{folder / 'tracks.json'}: is not a list of tracks ({error})") from None
     manifest, placed = _optional(folder / "report.json", dict), _optional(folder / "cameras.json", dict)
     try:
         cameras = {name: _camera(entry) for name, entry in placed.get("photographs", {}).items()}
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except _FAULTS as error:
         raise InputError(f"{folder / 'cameras.json'}: is not a list of cameras ({error})") from None
     try:
         shots = tuple(_shot(entry, folder, visits, cameras) for entry in manifest.get("photographs", []))
-    except (KeyError, TypeError, ValueError) as error:
+        if any(not 0 <= shot.visit < len(visits) for shot in shots):
+            raise ValueError("a visit beyond the list of visits")
+    except _FAULTS as error:
         raise InputError(f"{folder / 'report.json'}: is not a list of photographs ({error})") from None
     capture = placed.get("capture")
     return Run(
@@ -125,8 +132,8 @@ def read_run(folder: Path) -> Run:
         objects=objects,
         shots=shots,
         placements=placements,
-        metrics=_optional(folder / "metrics.json", list),
-        stages=_optional(folder / "stages.json", list),
+        metrics=_rows(folder / "metrics.json", named=("key",), words=("visit", "region", "unit", "direction")),
+        stages=_rows(folder / "stages.json", named=(), words=("stage", "name", "status")),
         config=_optional(folder / "config.json", dict),
         env=_optional(folder / "env.json", dict),
     )
@@ -134,6 +141,28 @@ def read_run(folder: Path) -> Run:
 
 def _optional(path: Path, expected: type) -> Any:
     return read_json(path, expected) if path.exists() else expected()
+
+
+def _rows(path: Path, *, named: tuple[str, ...], words: tuple[str, ...]) -> list[dict]:
+    """A list of rows. Raises InputError when one is no row, lacks what is `named`, or has no text where words go."""
+    rows = _optional(path, list)
+    for i, row in enumerate(rows):
+        sound = isinstance(row, dict) and all(isinstance(row.get(key), str) for key in named)
+        if not sound or any(not isinstance(row.get(key), str | None) for key in words):
+            raise InputError(f"{path}: row {i} is not what it should be ({row!r:.60})")
+    return rows
+
+
+def _real(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def _whole(value: Any) -> int | None:
+    return None if value is None else int(value)
+
+
+def _text(value: Any) -> str | None:
+    return None if value is None else str(value)
 
 
 def _object(entry: dict) -> Object:
@@ -154,14 +183,14 @@ def _state(entry: dict) -> State:
         event=str(entry["event"]),
         visible=bool(entry["visible"]),
         pose=None if pose is None else _motion(pose),
-        confidence=entry.get("confidence"),
+        confidence=_real(entry.get("confidence")),
         ambiguous_axis=entry.get("ambiguous_axis"),
     )
 
 
 def _shot(entry: dict, folder: Path, visits: tuple[str, ...], cameras: dict[str, Camera]) -> Shot:
     def path(key: str) -> Path | None:
-        return folder / entry[key] if entry.get(key) else None  # an absolute path stays as it is
+        return folder / str(entry[key]) if entry.get(key) else None  # an absolute path stays as it is
 
     visit = entry["visit"]
     return Shot(
@@ -172,9 +201,9 @@ def _shot(entry: dict, folder: Path, visits: tuple[str, ...], cameras: dict[str,
         render=path("render_path"),
         initial=path("initial_render_path"),
         mask=path("mask_path"),
-        psnr=entry.get("psnr"),
-        initial_psnr=entry.get("initial_psnr"),
-        camera=cameras.get(entry["name"]),
+        psnr=_real(entry.get("psnr")),
+        initial_psnr=_real(entry.get("initial_psnr")),
+        camera=cameras.get(str(entry["name"])),
     )
 
 

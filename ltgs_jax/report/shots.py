@@ -9,11 +9,12 @@ import numpy as np
 from ltgs_jax.io import scaled_size
 
 from .pictures import crop_box, difference, fitted, jpeg, overlay, read_ids, read_shown
-from .run import Run, Shot
+from .run import Object, Run, Shot
 from .words import ROLE_WORDS
 
 _CROP_SIDE = 208  # twice the height at which crops are shown
 _MOST_SHOTS = 120
+_MOST_AT_SOURCE = 2
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,9 @@ def make_gallery(run: Run) -> Gallery:
     gallery = Gallery(left_out=len(run.shots) - len(chosen))
     for shot in chosen:
         _add(gallery, shot, side)
+    for thing in run.objects:
+        if not any(crop.visit == thing.source_visit for crop in gallery.crops.get(thing.identity, [])):
+            gallery.crops.setdefault(thing.identity, []).extend(_at_source(thing, chosen))
     for crops in gallery.crops.values():
         crops.sort(key=lambda crop: (crop.visit, -crop.pixels))
     return gallery
@@ -86,6 +90,40 @@ def _add_crops(gallery: Gallery, shot: Shot, ids: np.ndarray, capture, render) -
         urls = ["" if image is None else jpeg(_cropped(image, box, ids.shape)) for image in (capture, render)]
         crop = Crop(shot.visit, shot.name, int((ids == identity).sum()), *urls)
         gallery.crops.setdefault(identity, []).append(crop)
+
+
+def _at_source(thing: Object, shots: Iterable[Shot]) -> list[Crop]:
+    """An object that no mask of its first visit shows: where its pose puts it, in the photographs that show it best."""
+    found = []
+    for shot in shots:
+        box = _box_of(thing, shot) if shot.visit == thing.source_visit else None
+        if box is not None:
+            found.append(((box[1] - box[0]) * (box[3] - box[2]), box, shot))
+    crops = []
+    for pixels, box, shot in sorted(found, key=lambda entry: -entry[0])[:_MOST_AT_SOURCE]:
+        capture, render = read_shown(shot.capture), read_shown(shot.render)
+        if capture is not None and shot.camera is not None:
+            shape = (shot.camera.height, shot.camera.width)
+            urls = ["" if image is None else jpeg(_cropped(image, box, shape)) for image in (capture, render)]
+            crops.append(Crop(shot.visit, shot.name, pixels, *urls))
+    return crops
+
+
+def _box_of(thing: Object, shot: Shot) -> tuple[int, int, int, int] | None:
+    """Rows and columns around an object by its pose, in pixels of the camera; None unless it lies all in the image."""
+    pose = thing.pose(shot.visit)
+    if shot.camera is None or pose is None or not thing.visible(shot.visit):
+        return None
+    pixels, depths = shot.camera.project(pose.apply(thing.center[None]))
+    depth = float(depths[0])
+    if not depth > thing.size:
+        return None
+    column, row = np.asarray(pixels[0], float)
+    reach = 0.6 * thing.size * float(shot.camera.K[0, 0]) / depth  # half the diagonal, and a margin
+    top, bottom, left, right = row - reach, row + reach, column - reach, column + reach
+    if top < 0 or left < 0 or bottom > shot.camera.height or right > shot.camera.width:
+        return None
+    return round(top), round(bottom), round(left), round(right)
 
 
 def _cropped(image: np.ndarray, box: tuple[int, int, int, int], shape: tuple[int, ...]) -> np.ndarray:

@@ -104,7 +104,9 @@ def summary(run: Run) -> str:
     rejected = sum(entry.status == "rejected" for entry in run.placements)
     counts = Counter(state.event for thing in run.objects for state in thing.states.values() if state.event in CHANGES)
     changes = sum(counts.values())
-    parts = [_count(len(run.visits), "visit"), _count(len(run.placements), "photograph")]
+    later = all(not entry.name.startswith(f"{run.visits[0]}/") for entry in run.placements) if run.visits else False
+    placed = "later photograph" if later else "photograph"  # those of the first visit are not always listed
+    parts = [_count(len(run.visits), "visit"), _count(len(run.placements), placed)]
     if rejected:
         parts[-1] += f" ({rejected} left out)"
     parts += [_count(len(run.objects), "object"), _count(changes, "change")]

@@ -80,7 +80,10 @@ class Viewer:
 
     def highlight(self, identity: int | None) -> None:
         """Tint one object in its colour and name it; None for none."""
+        if identity == self._highlighted:
+            return
         self._highlighted = identity
+        self._chosen.value = _name_of(identity)
         for template, layer, handle in zip(self._chronology.templates, self._layers, self._objects, strict=True):
             chosen = template.identity == identity
             handle.rgbs = layer.tinted(color_of(template.identity)) if chosen else layer.rgbs
@@ -159,14 +162,11 @@ class Viewer:
         if not identities:
             return
         with gui.add_folder("objects"):
-            chosen = gui.add_dropdown("highlight", ["none", *(f"object {identity}" for identity in identities)])
-
-            @chosen.on_update
-            def _(_) -> None:
-                self.highlight(None if chosen.value == "none" else int(chosen.value.split()[1]))
-
+            names = {_name_of(identity): identity for identity in (None, *identities)}
+            self._chosen = gui.add_dropdown("highlight", list(names))
+            self._chosen.on_update(lambda _: self.highlight(names[self._chosen.value]))
             for identity in identities:
-                box = gui.add_checkbox(f"object {identity}", True)
+                box = gui.add_checkbox(_name_of(identity), True)
                 box.on_update(lambda event, k=identity: self.hide(k, not event.target.value))
 
     def _build_photographs_folder(self, gui) -> None:
@@ -210,7 +210,7 @@ class Viewer:
         chosen = [k for k, entry in enumerate(self._chronology.templates) if entry.identity == self._highlighted]
         self._labels = [
             self.server.scene.add_label(
-                f"template_{k}/label", f"object {self._highlighted}", position=extent_of(self._layers[k])[0]
+                f"template_{k}/label", _name_of(self._highlighted), position=extent_of(self._layers[k])[0]
             )
             for k in chosen
         ]
@@ -220,7 +220,7 @@ class Viewer:
         lines = [f"**{self._run.visits[self.visit]}**"]
         for entry in happenings(self._run, self.visit):
             sure = "" if entry.state.confidence is None else f" ({entry.state.confidence:.2f})"
-            lines.append(f"- object {entry.thing.identity} {entry.sentence}{sure}")
+            lines.append(f"- {_name_of(entry.thing.identity)} {entry.sentence}{sure}")
         if len(lines) == 1:
             lines.append("first visit" if self.visit == 0 else "nothing changed")
         return "\n".join(lines)
@@ -231,6 +231,10 @@ class Viewer:
         self._image.visible = image is not None
         if image is not None and not np.array_equal(image, self._image.image):
             self._image.image = image
+
+
+def _name_of(identity: int | None) -> str:
+    return "none" if identity is None else f"object {identity}"
 
 
 def _add_splats(scene, name: str, layer: Layer):
