@@ -22,6 +22,8 @@ from ltgs_jax.template import (
     explained,
     firm_part,
     make_crop,
+    middle_of,
+    place_template,
     search_template,
     settle_template,
     support_below,
@@ -31,6 +33,7 @@ from .config import Config
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
+_PARTLY = 0.1  # share of an object's outline that must have changed for it to be looked for at another turn
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 _FLAT = 0.25  # height over width under which something on bared ground is the ground itself
@@ -141,41 +144,59 @@ def turn_in_place(
     rng: np.random.Generator,
     progress,
 ) -> tuple[State, list[Account]]:
-    """What seemed to leave and stands where it stood, turned or nudged: looked for there before anything else, since
-    colours that happen to agree leave only pieces of such a change."""
+    """What seemed to leave, or changed in part, and stands where it stood, turned or nudged: looked for there before
+    anything else, since colours that happen to agree leave only pieces of such a change."""
     accounts = []
-    for k in sorted(gone):
+    for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
         support, template = state.supports[k], state.chronology.templates[k]
         if support is None:
             continue
         before = state.chronology.world_from_template[t - 1, k]
-        shown = scene_at(set_from(state, t, k, visible=True, pose=before), t)
+        # Without it, whether it seemed to leave or not: its place has to be explained anew.
+        hidden, without = state, evidence
+        if k not in gone:
+            hidden = set_from(state, t, k, visible=False)
+            without = compare(eye, scene_at(hidden, t), observations, front_end, config)
+        shown = scene_at(set_from(hidden, t, k, visible=True, pose=before), t)
         cover = eye.cover(shown, [k], observations)
-        regions = [dilate(c, 4) & m for c, m in zip(cover, evidence.masks, strict=True)]
-        views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, evidence.masks, strict=True))
+        regions = [dilate(c, 4) & m for c, m in zip(cover, without.masks, strict=True)]
+        views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, without.masks, strict=True))
         if views == 0:
             continue
         points = np.asarray(before.apply(jnp.asarray(template.splats.means)), np.float64)
-        instance = Instance(points, tuple(regions), views)
-        crop = _crop_around(instance, observations, evidence, config)
+        crop = _crop_around(Instance(points, tuple(regions), views), observations, without, config)
         size = template_diameter(template.splats)
         search = search_template(
-            template, support, support, np.median(points, axis=0), crop,
+            template, support, support.moved(before), middle_of(points), crop,
             size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
         )  # fmt: skip
         if search.best_gain < 0.5 * config.template.tau_gain:
             continue
         found = settle_template(search, crop, size=size, refiner=eye.refiner)
-        if not _convincing(found, config):
+        still = place_template(search, before, crop, size=size, refiner=eye.refiner)
+        if not _convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
             continue
         pair, placed = [(0, k)], {(0, k): found}
-        if _unexplained(state, t, pair, placed, observations, evidence, front_end, eye=eye, config=config):
+        if _unexplained(hidden, t, pair, placed, observations, without, front_end, eye=eye, config=config):
             continue
         doubt = config.detect.moved
         state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=doubt)
         progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
         accounts.append(Account(k, "moved", found.gain, found.error, views))
     return state, accounts
+
+
+def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
+    """Templates that seemed to leave, and those of which two photographs or more show a part that changed."""
+    scene = scene_at(state, t)
+    for k in range(len(state.chronology.templates)):
+        if k in gone:
+            yield k
+        elif bool(np.asarray(state.chronology.visible)[t, k]):
+            cover = eye.cover(scene, [k], observations)
+            shares = [(c & m).sum() / max(c.sum(), 1) for c, m in zip(cover, evidence.masks, strict=True)]
+            if sum(share > _PARTLY for share in shares) >= 2:
+                yield k
 
 
 def _unexplained(

@@ -2,6 +2,8 @@
 
 from .arrival import Placement as Placement
 from .arrival import build_template as build_template
+from .arrival import middle_of as middle_of
+from .arrival import place_template as place_template
 from .arrival import search_template as search_template
 from .arrival import settle_template as settle_template
 from .arrival import support_below as support_below

@@ -34,6 +34,12 @@ class Placement(eqx.Module):
     outlines: Bool[np.ndarray, "v s s"]
 
 
+def middle_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """The middle of the box that holds the central 90 % of points along each axis: where the seen side of an object has
+    more of them than the other, their median is not on its axis."""
+    return np.quantile(points, [0.05, 0.95], axis=0).mean(axis=0)
+
+
 def rotation_between(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """The smallest rotation that takes unit vector a to b."""
     axis, cosine = np.cross(a, b), float(a @ b)
@@ -62,7 +68,7 @@ def pose_hypotheses(
     and 0.8 `spread` wide. Upright, it keeps its height above what it stood on, of which the lowest points may say
     little: no photograph shows them; tilted, the lowest points touch the support.
     """
-    center = np.quantile(template, [0.05, 0.95], axis=0).mean(axis=0)
+    center = middle_of(template)
     stood = stood_on.height(center[None])[0]
     align = rotation_between(stood_on.normal, stands_on.normal)
     axes = stands_on.frame()
@@ -172,8 +178,12 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     """Refine the best two poses of a search on the pixels, in all six freedoms."""
     tolerance = 0.1 * size
     found = refiner.refine(search.template, search.poses[:2], crop, size=size, tolerance=tolerance, steps=12, blurred=3)
-    pose = found.poses[int(np.argmin(found.errors))]
-    images, cover = refiner.images(search.template, pose[None], crop, tolerance)
+    return place_template(search, found.poses[int(np.argmin(found.errors))], crop, size=size, refiner=refiner)
+
+
+def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
+    """A search's template at this very pose, and how well it explains the windows there."""
+    images, cover = refiner.images(search.template, pose[None], crop, 0.1 * size)
     error, gain = explained(images[0], crop)
     covered = cover[0] > 0.5
     overlap, alike = overlap_of(images[0], covered, crop), likeness(images[0], cover[0], crop)

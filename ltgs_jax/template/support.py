@@ -5,6 +5,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
+from ltgs_jax.geometry import SE3
+
 _STEEP = 0.02  # what a steep plane counts for beside a level one: things hang on walls, but rarely
 _LEVEL = np.radians(15)  # by which a surface that things stand on, or the guess of what is up, may be off
 
@@ -19,6 +21,12 @@ class Support(eqx.Module):
     def height(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
         """Signed distance of points above the plane, in scene units."""
         return points @ self.normal - self.offset
+
+    def moved(self, pose: SE3) -> "Support":
+        """The plane where a rigid motion takes it."""
+        matrix = np.asarray(pose.as_matrix(), np.float64)
+        normal = matrix[:3, :3] @ self.normal
+        return Support(normal, self.offset + float(normal @ matrix[:3, 3]), self.noise)
 
     def frame(self) -> Float[np.ndarray, "3 3"]:
         """Rows: two axes in the plane and the normal."""
