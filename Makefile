@@ -11,7 +11,7 @@ STAMP := $(VENV)/installed
 DEMO_STAMP := $(VENV)/installed-demo
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.jax_cache
 
-.PHONY: demo test slow check format docs install lock clean
+.PHONY: demo test slow bench check format docs install lock clean
 
 demo: $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
 	$(BIN)/ltgs demo --out $(OUT)
@@ -21,6 +21,9 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+bench: $(STAMP)
+	$(BIN)/python -m experiments.bench --quick
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,0 +1,236 @@
+"""Markdown and plots from table.csv alone. A `Sheet` says which runs make one section, by their hashes.
+
+The page keeps what people wrote: only what stands between the two marks is written anew. Rows that are not there yet
+are missing in the page, and counted at its end; failures are listed with their reason. The best value of a column is
+bold, whosever it is.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments.engine import Run, mean_of
+
+BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
+_BOUNDS = ("3dgs-dense",)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One section: its name, how it is drawn (comparison, variants, curves, stability), and its runs by row."""
+
+    name: str
+    kind: str
+    runs: dict[str, list[Run]]
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column: heading, key in the table, digits, factor, and which way is better (+1 higher, −1 lower, 0 neither)."""
+
+    title: str
+    key: str
+    digits: int = 2
+    factor: float = 1.0
+    better: int = 0
+
+
+COLUMNS = (
+    Column("PSNR changed", "psnr_changed", better=1),
+    Column("PSNR full", "psnr_full", better=1),
+    Column("SSIM changed", "ssim_changed", 3, better=1),
+    Column("SSIM full", "ssim_full", 3, better=1),
+    Column("FLIP changed", "flip_changed", 3, better=-1),
+    Column("FLIP full", "flip_full", 3, better=-1),
+    Column("PSNR first visit", "psnr_full@0", better=1),
+    Column("events F1", "event_f1", better=1),
+    Column("CPU s", "seconds_cpu", 0, better=-1),
+    Column("compile s (wall)", "seconds_compile", 0),
+    Column("kB", "bytes", 0, 1e-3),
+    Column("frames/s", "fps", 0),
+)
+
+
+def table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table."""
+    head = list(header)
+    lines = [head, ["---"] * len(head), *(list(row) for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def _cells(named: dict[str, list[dict]], columns: tuple[Column, ...], rivals: Iterable[str]) -> list[list[str]]:
+    """Printed means per row, the best of the rivals in bold."""
+    values = {name: [column.factor * mean_of(rows, column.key) for column in columns] for name, rows in named.items()}
+    rivals = [name for name in rivals if name in values]
+    printed = {name: [name] for name in values}
+    for i, column in enumerate(columns):
+        finite = [values[name][i] for name in rivals if math.isfinite(values[name][i])]
+        best = (max if column.better > 0 else min)(finite) if finite and column.better else math.nan
+        for name in values:
+            value = values[name][i]
+            text = f"{value:.{column.digits}f}" if math.isfinite(value) else "–"
+            printed[name].append(f"**{text}**" if name in rivals and value == best and len(finite) > 1 else text)
+    return list(printed.values())
+
+
+def _done(runs: Iterable[Run], rows: dict[str, dict]) -> list[dict]:
+    return [rows[run.name] for run in runs if run.name in rows and rows[run.name]["status"] == "done"]
+
+
+def _comparison(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
+    """Means over the captures that every method has finished, then each capture, then each visit."""
+    labels = list(dict.fromkeys(run.options.scene.capture.label for runs in sheet.runs.values() for run in runs))
+    by = {
+        name: {run.options.scene.capture.label: rows[run.name] for run in runs if _done([run], rows)}
+        for name, runs in sheet.runs.items()
+    }
+    rivals = [name for name in by if name not in _BOUNDS and by[name]]
+    common = [label for label in labels if rivals and all(label in by[name] for name in rivals)]
+    text = f"Means over {', '.join(common) or 'no capture'} (those that every method with a row has finished).\n\n"
+    named = {name: [by[name][label] for label in common if label in by[name]] for name in by}
+    text += table(
+        ["method", *(c.title for c in COLUMNS)], _cells({k: v for k, v in named.items() if v}, COLUMNS, rivals)
+    )
+    for key, title in (("psnr_changed", "PSNR of the changed region"), ("psnr_full", "PSNR, full")):
+        text += f"\n{title}, capture by capture:\n\n"
+        lines: dict[str, list[str]] = {}
+        for label in labels:
+            column = Column(label, key, better=1)
+            cells = _cells({n: [by[n][label]] if label in by[n] else [] for n in by}, (column,), rivals)
+            for name, cell in cells:
+                lines.setdefault(name, []).append(cell)
+        text += table(["method", *labels], [[name, *cells] for name, cells in lines.items()])
+    visits = [Column(f"{r} {t}", f"psnr_{r}@{t}", better=1) for r in ("changed", "full") for t in (1, 2, 3)]
+    text += "\nPSNR visit by visit, over the same captures as the first table:\n\n"
+    text += table(
+        ["method", *(c.title for c in visits)],
+        _cells({k: v for k, v in named.items() if v}, tuple(visits), rivals),
+    )
+    points = [(n, mean_of(named[n], "seconds_cpu"), mean_of(named[n], "psnr_changed")) for n in named if named[n]]
+    picture = scatter(
+        points, images / "results_comparison.png", "CPU seconds, compilation included", "PSNR changed, dB"
+    )
+    return text + picture
+
+
+def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
+    """One row per variant of this system."""
+    named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
+    named = {name: found for name, found in named.items() if found}
+    labels = {run.options.scene.capture.scene for runs in sheet.runs.values() for run in runs}
+    return f"Capture: {', '.join(sorted(labels))}.\n\n" + table(
+        ["variant", *(c.title for c in COLUMNS)], _cells(named, COLUMNS, named)
+    )
+
+
+def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
+    """Per curve a table of its points and a plot of time against error."""
+    curves: dict[str, list[tuple[str, dict]]] = {}
+    for name, runs in sheet.runs.items():
+        curve, _, point = name.partition(": ")
+        curves.setdefault(curve, []).extend((point, row) for row in _done(runs, rows))
+    text = ""
+    for curve, points in curves.items():
+        if not points:
+            continue
+        what = points[0][1]["error_of"]
+        text += f"\n### {curve.capitalize()}\n\n" + table(
+            ["setting", "CPU time / control", what],
+            [[point, f"{row['seconds_ratio']:.3g}", f"{row['error']:.3g}"] for point, row in points],
+        )
+        triples = [(point, row["seconds_ratio"], row["error"]) for point, row in points]
+        text += scatter(triples, images / f"results_curve_{curve.replace(' ', '_')}.png", "CPU time / control", what)
+    return text
+
+
+def _stability(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
+    """Per driver a table of error growth, and one plot for all."""
+    drivers: dict[str, list[dict]] = {}
+    for name, runs in sheet.runs.items():
+        drivers.setdefault(name.partition(": ")[0], []).extend(_done(runs, rows))
+    text, lines = "", {}
+    for driver, found in drivers.items():
+        if not found:
+            continue
+        keys = [key for key in dict.fromkeys(k for row in found for k in row) if key.startswith("of ")]
+        text += f"\n### {driver.capitalize()}\n\n" + table(
+            [found[0]["driver_unit"], *(key.removeprefix("of ") for key in keys)],
+            [[f"{row['driver_value']:g}", *(_number(row.get(key)) for key in keys)] for row in found],
+        )
+        lines[driver] = [(row["driver_value"], row[keys[0]]) for row in found if isinstance(row.get(keys[0]), float)]
+    return text + _growth({k: v for k, v in lines.items() if len(v) > 1}, images / "results_stability.png")
+
+
+def _number(value: object) -> str:
+    return f"{value:.2g}" if isinstance(value, float) else str(value if value is not None else "–")
+
+
+def _axes(path: Path):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return plt.subplots(figsize=(6.4, 4.2))
+
+
+def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) -> str:
+    """A labelled scatter plot with logarithmic time; the Markdown that shows it, or nothing without a point."""
+    points = [p for p in points if math.isfinite(p[1]) and math.isfinite(p[2]) and p[1] > 0]
+    if not points:
+        return ""
+    figure, axes = _axes(path)
+    for name, a, b in points:
+        axes.plot(a, b, "o", color="tab:brown")
+        axes.annotate(name, (a, b), fontsize=7, xytext=(4, 3), textcoords="offset points")
+    axes.set(xlabel=x, ylabel=y, xscale="log")
+    errors = [b for _, _, b in points]
+    if min(errors) > 0 and max(errors) / min(errors) > 30:
+        axes.set_yscale("log")
+    figure.savefig(path, dpi=80, bbox_inches="tight")
+    return f"\n![{y} against {x}](images/{path.name})\n"
+
+
+def _growth(lines: dict[str, list[tuple[float, float]]], path: Path) -> str:
+    if not lines:
+        return ""
+    figure, axes = _axes(path)
+    for name, pairs in lines.items():
+        positive = [(max(a, 1e-9), max(b, 1e-9)) for a, b in pairs]
+        axes.loglog(*zip(*positive, strict=True), "o-", label=name)
+    axes.set(xlabel="driver", ylabel="first error of its table")
+    axes.legend(fontsize=7)
+    figure.savefig(path, dpi=80, bbox_inches="tight")
+    return f"\n![Error growth over each driver](images/{path.name})\n"
+
+
+_DRAW = {"comparison": _comparison, "variants": _variants, "curves": _curves, "stability": _stability}
+
+
+def write_results(
+    sheets: list[Sheet], rows: dict[str, dict], out: Path, *, page: Path | None = None, images: Path | None = None
+) -> Path:
+    """Draw every sheet that has a row; put the text between the marks of `page`, or into OUT/results.md."""
+    images = images or out / "images"
+    parts = []
+    for sheet in sheets:
+        runs = {run.name: run for group in sheet.runs.values() for run in group}
+        there = [name for name in runs if name in rows]
+        failed = [(runs[name], rows[name]) for name in there if rows[name]["status"] != "done"]
+        parts.append(f"\n## {sheet.name.capitalize()}\n\n{len(there)} of {len(runs)} runs are there.")
+        parts[-1] += " " + _DRAW[sheet.kind](sheet, rows, images) if len(there) > len(failed) else "\n"
+        if failed:
+            parts[-1] += "\nFailed:\n\n" + "".join(
+                f"- {run.task.split('.')[-1]} {getattr(run.options, 'label', '')}: {row['reason']}\n"
+                for run, row in failed
+            )
+    text = "\n".join(parts)
+    target = page or out / "results.md"
+    before, after = "", ""
+    if page is not None and page.is_file() and BEGIN in page.read_text():
+        before, rest = page.read_text().split(BEGIN, 1)
+        after = rest.split(END, 1)[1]
+    target.write_text(f"{before}{BEGIN}\n{text}\n{END}{after}")
+    return target

@@ -1,0 +1,217 @@
+"""Every table and plot of docs/results.md, from nothing, with one command; interrupted, the same command goes on.
+
+    python -m experiments.tables --preset fast [--out DIR] [--only comparison …] [--minutes 60] [--workers 0]
+    python -m experiments.tables --preset fast --draw-only        draws again from DIR/table.csv
+
+Presets: `tiny` is for trying things (minutes), `small` for a busy machine, `fast` for the page (meant for an hour on
+two quiet cores), `paper` at the size of the paper's runs (a GPU). `--captures FOLDER …` adds folders of yours to the
+comparison; `--cluster tcp://HOST:8786` runs on a Dask cluster. A sheet of `sheets()` is a name, its runs, and how its
+rows are drawn from the table alone.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from experiments.baselines.method import MethodConfig
+from experiments.baselines.system import RIGID, SystemConfig
+from experiments.captures import CaptureConfig
+from experiments.curves import curve_runs
+from experiments.engine import Run, grid, read_table, rebuild_table, run_all, vary
+from experiments.report import Sheet, write_results
+from experiments.scenes import SceneConfig
+from experiments.stability import stability_runs
+from ltgs_jax.fit import InitialConfig
+
+_BASELINES = "experiments.baselines"
+_SYSTEM = f"{_BASELINES}.system:run"
+METHODS = {
+    "untouched": f"{_BASELINES}.static:run_untouched",
+    "3dgs-all": f"{_BASELINES}.static:run_all_photographs",
+    "3dgs-refit": f"{_BASELINES}.static:run_refit",
+    "few-shot": f"{_BASELINES}.few_shot:run",
+    "deformation": f"{_BASELINES}.over_time:run_deformation",
+    "steps": f"{_BASELINES}.over_time:run_steps",
+    "local": f"{_BASELINES}.local:run",
+    "expert": f"{_BASELINES}.expert:run",
+    "3dgs-dense": f"{_BASELINES}.static:run_dense",
+}
+_LATER = ("3dgs-dense",)  # bounds, not rivals: they look at photographs that no other may
+
+
+@dataclass(frozen=True)
+class Preset:
+    """How large everything is."""
+
+    scene: SceneConfig
+    steps: int
+    """Of each fit of a baseline."""
+    system: str
+    """Preset of `ltgs update`."""
+    scenes: tuple[str, ...] = ("move", "turnover", "clutter", "nochange", "light")
+    seeds: tuple[int, ...] = (0,)
+    effort: int = 1
+    """Factor on the trials of the curves and of the stability page."""
+
+
+PRESETS = {
+    "tiny": Preset(
+        SceneConfig(
+            CaptureConfig(width=96, height=72, dense=8, update=2, test=1, points=800),
+            96,
+            InitialConfig(steps=60, max_splats=2000, sh_degree=0),
+        ),
+        steps=20,
+        system="tiny",
+        scenes=("move",),
+    ),
+    "small": Preset(SceneConfig(), steps=250, system="tiny"),
+    "fast": Preset(
+        SceneConfig(initial=InitialConfig(steps=600, max_splats=8000, sh_degree=0)), steps=250, system="fast"
+    ),
+    "paper": Preset(
+        SceneConfig(
+            CaptureConfig(width=640, height=480, dense=60, test=8, points=12000),
+            640,
+            InitialConfig(steps=7000, max_splats=200_000, sh_degree=3),
+        ),
+        steps=5000,
+        system="paper",
+        seeds=(0, 1, 2),
+        effort=4,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to run and where."""
+
+    preset: str = "fast"
+    """tiny, small, fast or paper."""
+    out: Path = Path("out/experiments")
+    """Folder of runs, captures, table.csv and the drawn page."""
+    only: tuple[str, ...] = ()
+    """Names of sheets; none means all."""
+    captures: tuple[Path, ...] = ()
+    """Folders to compare on besides the built-in captures."""
+    max_side: int | None = None
+    """Longest side at which photographs of such folders are worked on; None: the preset's."""
+    minutes: float = 60.0
+    """After so many minutes no further run is started; what is there is drawn."""
+    workers: int = 0
+    """Local processes; 0: this one, which shares its compiled programs between runs."""
+    cluster: str | None = None
+    """Address of a Dask scheduler."""
+    retry: bool = False
+    """Try failed runs again."""
+    draw_only: bool = False
+    """Draw from the table, run nothing."""
+    page: Path | None = None
+    """Markdown file whose generated part is written anew (docs/results.md); None: OUT/results.md alone."""
+    images: Path | None = None
+    """Folder of the plots; None: OUT/images."""
+
+
+def comparison_runs(
+    preset: Preset, folders: tuple[Path, ...] = (), max_side: int | None = None
+) -> dict[str, list[Run]]:
+    """Every method on every capture."""
+    built_in = [
+        vary(vary(preset.scene, "capture.scene", scene), "capture.seed", seed)
+        for scene in preset.scenes
+        for seed in preset.seeds
+    ]
+    given = [
+        dataclasses.replace(
+            preset.scene, capture=CaptureConfig(scene=str(f)), max_side=max_side or preset.scene.max_side
+        )
+        for f in folders
+    ]
+    scenes = built_in + given
+    runs = {
+        "ltgs": [Run(_SYSTEM, SystemConfig(scene, preset.system)) for scene in scenes],
+        "rigid": [Run(_SYSTEM, SystemConfig(scene, preset.system, RIGID)) for scene in scenes],
+    }
+    for name, task in METHODS.items():
+        chosen = built_in if name in _LATER else scenes
+        runs[name] = [Run(task, MethodConfig(scene, preset.steps)) for scene in chosen]
+    order = ("untouched", "ltgs", "rigid", *METHODS)
+    return {name: runs[name] for name in dict.fromkeys(order)}
+
+
+def _variants(preset: Preset, scene: str, changes: dict[str, tuple[tuple[str, float | int | bool], ...]]):
+    base = SystemConfig(vary(preset.scene, "capture.scene", scene), preset.system)
+    return {name: [Run(_SYSTEM, dataclasses.replace(base, overrides=over))] for name, over in changes.items()}
+
+
+ABLATION = {
+    "full": (),
+    "without known objects": (("template.tau_same", 2.0), ("template.tau_likeness", 2.0)),
+    "without pose refinement": (("fit.long.fit_poses", False),),
+    "without background refinement": (("fit.long.background_rate", 0.0),),
+    "without photographs of the first visit": (("fit.long.replay", 0.0),),
+    "without the long fit": (("fit.long.steps", 0),),
+}
+HYPERPARAMETERS = {
+    "detect.sigmas": (3.0, 5.0, 8.0),
+    "detect.gamma": (0.5, 0.7, 0.9),
+    "match.min_new": (0.15, 0.3, 0.6),
+    "template.tau_same": (0.2, 0.35, 0.5),
+    "fit.long.steps": (0, 80, 200),
+}
+
+
+def sheets(preset: Preset, options: Options) -> list[Sheet]:
+    """All tables, in the order in which they are worked on."""
+    scene = preset.scenes[min(1, len(preset.scenes) - 1)]
+    base = SystemConfig(vary(preset.scene, "capture.scene", scene), preset.system)
+    views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 4, 6))
+    poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.1, 0.3, 1.0))
+    features = grid(_SYSTEM, base, feature_noise=(0.0, 0.1, 0.3, 1.0))
+    hyper = {}
+    for name, values in HYPERPARAMETERS.items():
+        hyper |= _variants(preset, scene, {f"{name} {value}": ((name, value),) for value in values})
+    return [
+        Sheet("comparison", "comparison", comparison_runs(preset, options.captures, options.max_side)),
+        Sheet("ablation", "variants", _variants(preset, scene, ABLATION)),
+        Sheet("curves", "curves", curve_runs(preset.effort)),
+        Sheet("stability", "stability", stability_runs(preset.effort)),
+        Sheet("views", "variants", {f"{r.options.scene.capture.update} photographs a visit": [r] for r in views}),
+        Sheet("poses", "variants", {f"{r.options.scene.capture.pose_noise}° on given poses": [r] for r in poses}),
+        Sheet("features", "variants", {f"{r.options.feature_noise} of a descriptor's norm": [r] for r in features}),
+        Sheet("hyperparameters", "variants", hyper),
+    ]
+
+
+def main(options: Options) -> None:
+    """Run what is missing, rebuild the table, draw."""
+    if options.preset not in PRESETS:
+        raise SystemExit(f"--preset: expected one of {', '.join(PRESETS)}, got {options.preset!r}")
+    every = sheets(PRESETS[options.preset], options)
+    names = [sheet.name for sheet in every]
+    unknown = [name for name in options.only if name not in names]
+    if unknown:
+        raise SystemExit(f"--only: expected some of {', '.join(names)}, got {unknown[0]!r}")
+    chosen = [sheet for sheet in every if not options.only or sheet.name in options.only]
+    if options.draw_only:
+        rebuild_table(options.out)
+    else:
+        runs = [run for sheet in chosen for group in sheet.runs.values() for run in group]
+        run_all(
+            runs,
+            options.out,
+            workers=options.workers,
+            cluster=options.cluster,
+            retry=options.retry,
+            deadline=60 * options.minutes,
+            say=lambda line: print(line, flush=True),
+        )
+    written = write_results(every, read_table(options.out), options.out, page=options.page, images=options.images)
+    print(f"table: {options.out / 'table.csv'}; page: {written}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options, description=__doc__))
