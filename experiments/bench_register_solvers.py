@@ -16,7 +16,13 @@ from ltgs_jax.geometry import SE3
 from ltgs_jax.register import register
 from ltgs_jax.register.hypotheses import Problem
 from ltgs_jax.register.outcome import RegisterConfig
-from ltgs_jax.register.refine import final_solve, isotropic_whitener, robust_residuals, whitened_residuals
+from ltgs_jax.register.refine import (
+    ResidualLaw,
+    final_solve,
+    isotropic_whitener,
+    robust_residuals,
+    whitened_residuals,
+)
 
 
 def kabsch(src: np.ndarray, dst: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -104,12 +110,12 @@ def compare_inner(cases: list[dict], errors, sigmas: float) -> list[dict]:
         warnings.simplefilter("ignore", DeprecationWarning)
         import jaxopt
 
-    config = RegisterConfig()
+    config, law = RegisterConfig(), ResidualLaw.of_bound(jnp.float32)
     start_off = SE3.exp(jnp.asarray([0.01, -0.01, 0.01, 0.01, 0.01, -0.01], jnp.float32))
 
     def residuals(tangent, start, problem):
         motion = start @ SE3.exp(tangent)
-        return robust_residuals(whitened_residuals(motion, problem, isotropic_whitener(problem))).ravel()
+        return robust_residuals(whitened_residuals(motion, problem, isotropic_whitener(problem)), law).ravel()
 
     def by_jaxopt(kind):
         def solve(start, problem):
@@ -128,7 +134,7 @@ def compare_inner(cases: list[dict], errors, sigmas: float) -> list[dict]:
         return solve
 
     def by_room(start, problem):
-        return final_solve(start, problem, isotropic_whitener(problem), config)[0]
+        return final_solve(start, problem, isotropic_whitener(problem), law, config)[0]
 
     kinds = {
         "room (optimistix LM, normal equations)": by_room,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jax.lax import Precision
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from ltgs_jax.geometry import SE3
 
@@ -25,6 +25,9 @@ _LEAST_NULL = 2.5
 _CHANGE = 1.0
 # Share of the best distinction from which a finalist counts as a rival of the best.
 _RIVAL = 0.6
+# Residuals of the stated noise score 1.27 times as much at twice the bound and 0.40 times at half of it; of twice the
+# noise 2.5 and 0.19 times, of half the noise 1.05 and 0.79 times. Between them, by geometric means:
+_WIDENS, _NARROWS = 1.8, 0.56
 # Spread of the best chance score over permutations: a share of it and a part of a vote (measured, N = 20 to 1000).
 _NULL_SPREAD = (0.09, 0.1)
 
@@ -34,10 +37,11 @@ class Consensus(eqx.Module):
 
     `motions` its best versions at the bound and at the narrower `LEVELS` of it; `distinction` how far its score lies
     above the best one of the same search on permuted correspondences, in units of the latter's spread; `null` the
-    latter.
+    latter; `plain` whether it stands out at the given bound and its scores at others are those of the stated noise.
     """
 
     motions: SE3
+    plain: Bool[Array, ""]
     distinction: Float[Array, ""]
     null: Float[Array, ""]
     bound: Float[Array, ""]
@@ -110,11 +114,15 @@ def _attempt(problem: Problem, key: PRNGKeyArray, effort: Effort, config: Regist
     level = jnp.where(clear[0] >= config.settle, 0, jnp.argmax(clear - handicap[:, 0]))
     bound = problem.bound * jnp.asarray(_COMPARED, problem.src.dtype)[level]
     exact = jnp.argmax(jnp.where(same, _scores(motions, problem.at_bound(bound), LEVELS), -jnp.inf), axis=1)
-    return Consensus(motions[exact], (clear - handicap[:, 0])[level], null[level], bound)
+    at_given, at_twice, _, at_half, _ = scores[0][:, exact[0]]
+    stated = (at_twice < _WIDENS * at_given) & (at_half < _NARROWS * at_given)
+    plain = stated & (clear[0] >= config.settle)
+    return Consensus(motions[exact], plain, (clear - handicap[:, 0])[level], null[level], bound)
 
 
 def _sweep(first: Consensus, problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
-    """Thorough searches at the factors of the noise bound in turn, until one stands out."""
+    """Where the first is not plain, a search over bounds at once; then thorough ones in turn, until one stands out."""
+    pooled = jax.lax.cond(first.plain, lambda: first, lambda: _attempt(problem, key, config.quick, config))
     factors = jnp.asarray(config.bound_factors, problem.src.dtype)
 
     def unsettled(state):
@@ -127,7 +135,7 @@ def _sweep(first: Consensus, problem: Problem, key: PRNGKeyArray, config: Regist
         better = (step == 0) | (new.distinction > best.distinction + _CHANGE)
         return step + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
 
-    return jax.lax.while_loop(unsettled, attempt, (jnp.asarray(0), first))[1]
+    return jax.lax.while_loop(unsettled, attempt, (jnp.asarray(0), pooled))[1]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
@@ -150,15 +158,15 @@ def _zero_tangent(leaf):
 
 
 def find_consensus(problem: Problem, key: PRNGKeyArray, config: RegisterConfig) -> Consensus:
-    """Consensus at the given bound by a quick search, or, where that does not stand out, by thorough ones.
+    """Consensus by a first search at the given bound; where that is not plain, by a quick one at several bounds.
 
-    The sweep over factors of the bound ends at the first with the distinction `settle`.
+    Where that does not stand out either, by thorough ones at factors of the bound, up to the distinction `settle`.
     """
-    first = _attempt(problem, key, config.quick, config)
+    first = _attempt(problem, key, config.first, config)
     return _sweep_where_needed(first, problem, key, config)
 
 
 def find_second(problem: Problem, config: RegisterConfig) -> tuple[SE3, Float[Array, ""]]:
-    """The motion that most of the problem's weights agree on, by a quick search without a null, and its score."""
-    best = search(problem, config.quick, config).top(1)
+    """The motion that most of the problem's weights agree on, by the first search without a null, and its score."""
+    best = search(problem, config.first, config).top(1)
     return best.motion[0], best.score[0]

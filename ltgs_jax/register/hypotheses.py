@@ -99,7 +99,8 @@ def _local_sets(problem: Problem, effort: Effort) -> Float[Array, "s n"]:
     count = min(effort.points, size)
     every = jnp.arange(size)
     if size <= BLOCK:
-        compatible = _compatibility(problem, every, every)
+        # Else XLA computes it anew for each of its uses.
+        compatible = jax.lax.optimization_barrier(_compatibility(problem, every, every))
         _, seeds = jax.lax.top_k(jnp.sum(compatible, axis=1), count)
         if size <= _PAIRED and effort.pairs:
             second = compatible * jnp.matmul(compatible, compatible, precision=Precision.HIGHEST)

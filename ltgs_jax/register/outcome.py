@@ -43,14 +43,16 @@ class Effort(eqx.Module):
 class RegisterConfig(eqx.Module):
     """Options of `register`; all static."""
 
+    first: Effort = eqx.field(static=True, default=Effort(points=16, pairs=0, finalists=6, bound_factors=(1.0,)))
+    """The first search; where its answer stands out from chance and has the noise that was said, the only one."""
     quick: Effort = eqx.field(
         static=True, default=Effort(points=32, pairs=0, finalists=6, bound_factors=(1.0, 4.0, 0.25))
     )
-    """The first search; where its answer stands out from chance, the only one."""
+    """The search of what the first left open."""
     thorough: Effort = eqx.field(
         static=True, default=Effort(points=1024, pairs=512, finalists=16, bound_factors=(1.0,))
     )
-    """The searches of what the first left open."""
+    """The searches of what both left open."""
     anneal: tuple[float, ...] = eqx.field(static=True, default=(4.0, 2.0, 1.0))
     """Bounds of the Geman-McClure annealing of each hypothesis, in units of the noise bound."""
     refine_steps: int = eqx.field(static=True, default=6)

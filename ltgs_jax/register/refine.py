@@ -1,5 +1,6 @@
 """Final robust least squares on the tangent of SE(3), with optimistix, and what it says about the answer."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -16,18 +17,46 @@ from .outcome import RegisterConfig
 BOUND_IN_SIGMA = 3.3682
 
 
-def robust_residuals(whitened: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """Residuals whose squares sum to −2·log likelihood of an inlier Gaussian with a constant share of outliers.
+# Of the final solve, per unit of the whitened normal equations: far under what one point adds.
+_DAMPING = 1e-2
+# Widths, in units of σ, of what lies near a right answer: exact pairs, and near misses on the surface around.
+NEAR_WIDTHS = (1.0, 2.0, 4.0, 8.0)
 
-    `whitened` in units of σ. The share is such that a residual at the noise bound is an inlier with odds of one: a
-    smooth truncated least squares, ρ = −2·log((exp(−m²/2) + c)/(1 + c)).
-    """
+
+class ResidualLaw(eqx.Module):
+    """How residuals are spread: Gaussians of `NEAR_WIDTHS`, of heights `near` at 0, over a `flat` rest."""
+
+    near: Float[Array, " k"]
+    flat: Float[Array, ""]
+
+    @staticmethod
+    def of_bound(dtype) -> "ResidualLaw":
+        """Before anything is known: one Gaussian, whose odds at the noise bound are even."""
+        heights = jnp.zeros(len(NEAR_WIDTHS), dtype).at[0].set(1)
+        return ResidualLaw(heights, jnp.exp(jnp.asarray(-0.5 * BOUND_IN_SIGMA**2, dtype)))
+
+    def _terms(self, squared: Float[Array, "*n"]) -> tuple[Float[Array, "*n k"], Float[Array, " k"]]:
+        precision = jnp.asarray(NEAR_WIDTHS, squared.dtype) ** -2
+        return -0.5 * squared[..., None] * precision, precision
+
+    def loss(self, squared: Float[Array, " n"]) -> Float[Array, " n"]:
+        """−2·log density of squared residuals in units of σ², 0 at 0."""
+        exponents, _ = self._terms(squared)
+        return -2 * jnp.log1p(jnp.sum(self.near * jnp.expm1(exponents), axis=-1) / (jnp.sum(self.near) + self.flat))
+
+    def trust(self, squared: Float[Array, "*n"]) -> Float[Array, "*n"]:
+        """Derivative of the loss: the weight of a residual, 1 for a sure exact pair."""
+        exponents, precision = self._terms(squared)
+        density = self.near * jnp.exp(exponents)
+        return jnp.sum(density * precision, axis=-1) / (jnp.sum(density, axis=-1) + self.flat)
+
+
+def robust_residuals(whitened: Float[Array, "n 3"], law: ResidualLaw) -> Float[Array, "n 3"]:
+    """Residuals whose squares sum to −2·log likelihood under the law; `whitened` in units of σ."""
     squared = jnp.sum(whitened * whitened, axis=-1)
-    outlier = jnp.exp(jnp.asarray(-0.5 * BOUND_IN_SIGMA**2, squared.dtype))
     positive = squared > 0
     safe = jnp.where(positive, squared, 1)
-    rho = -2 * jnp.log1p(jnp.expm1(-0.5 * safe) / (1 + outlier))
-    factor = jnp.where(positive, jnp.sqrt(rho / safe), jax.lax.rsqrt(1 + outlier))
+    factor = jnp.sqrt(jnp.where(positive, law.loss(safe) / safe, law.trust(jnp.zeros_like(safe))))
     return factor[:, None] * whitened
 
 
@@ -41,28 +70,26 @@ def inlier_probability(whitened: Float[Array, "n 3"]) -> Float[Array, " n"]:
     return probability_within(jnp.sum(whitened * whitened, axis=-1) / BOUND_IN_SIGMA**2)
 
 
-def whitened_residuals(motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Residuals in units of their standard deviation."""
+def whitened_residuals(motion: SE3, problem: Problem, whitener: Float[Array, "*n3"]) -> Float[Array, "n 3"]:
+    """Residuals in units of their standard deviation; `whitener` [] where that is equal all round, else [n, 3, 3]."""
     residuals = motion.apply(problem.src) - problem.dst
+    if whitener.ndim == 0:
+        return whitener * residuals
     return jnp.einsum("nij,nj->ni", whitener, residuals, precision=Precision.HIGHEST)
 
 
-def isotropic_whitener(problem: Problem) -> Float[Array, "n 3 3"]:
+def isotropic_whitener(problem: Problem) -> Float[Array, ""]:
     """Whitener of equal noise in all directions, whose 99 % bound is the noise bound."""
-    eye = jnp.eye(3, dtype=problem.src.dtype) * (BOUND_IN_SIGMA / problem.bound)
-    return jnp.broadcast_to(eye, (*problem.weights.shape, 3, 3))
+    return BOUND_IN_SIGMA / problem.bound
 
 
-def approach(start: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], steps: int) -> SE3:
+def approach(start: SE3, problem: Problem, whitener: Float[Array, "*n3"], law: ResidualLaw, steps: int) -> SE3:
     """Reweighted Gauss-Newton steps in closed 6×6 form: cheap, and precise where a cost is rounded away."""
-    weights = problem.weights
 
     def step(_, motion):
         whitened = whitened_residuals(motion, problem, whitener)
-        jacobian = tangent_jacobian(motion, problem, whitener)
-        trust = weights * inlier_probability(whitened)
-        normal = jnp.einsum("n,nij,nik->jk", trust, jacobian, jacobian, precision=Precision.HIGHEST)
-        gradient = jnp.einsum("n,nij,ni->j", trust, jacobian, whitened, precision=Precision.HIGHEST)
+        trust = problem.weights * law.trust(jnp.sum(whitened * whitened, axis=-1))
+        normal, gradient = normal_equations(motion, problem, whitener, trust)
         # Keeps a direction that no point fixes where it is.
         ridge = jnp.finfo(normal.dtype).eps * (1 + jnp.trace(normal))
         return motion @ SE3.exp(-jnp.linalg.solve(normal + ridge * jnp.eye(6, dtype=normal.dtype), gradient))
@@ -71,24 +98,27 @@ def approach(start: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], step
 
 
 def final_solve(
-    start: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], config: RegisterConfig
+    start: SE3, problem: Problem, whitener: Float[Array, "*n3"], law: ResidualLaw, config: RegisterConfig
 ) -> tuple[SE3, Bool[Array, ""]]:
     """The robust optimum near `start`, and whether the solver got there.
 
     The unknown is the tangent in units of σ, so that tolerances mean shares of the noise. Differentiable in the points
-    and the whitener by the implicit function theorem at the optimum; the start carries no gradient.
+    and the whitener by the implicit function theorem at the optimum; the start and the law carry no gradient.
     """
-    start = jax.lax.stop_gradient(start)
+    start, law = jax.lax.stop_gradient((start, law))
     sigma = jax.lax.stop_gradient(problem.bound) / BOUND_IN_SIGMA
     # A cost rounded at eps resolves steps of √eps.
     tolerance = float(jnp.finfo(start.xyz.dtype).eps) ** 0.5
     # The QR of a tall Jacobian costs ten times its 6×6 normal equations, which are well scaled here.
     solver = optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(lx.Cholesky()))
+    # From a start that is at the optimum but for rounding, a trust region would judge steps by the cost's rounding and
+    # refuse some; constant damping takes two steps, and only keeps directions that no point fixes from growing.
+    solver = eqx.tree_at(lambda s: s.search, solver, optx.LearningRate(1 / _DAMPING))
 
     def residuals(tangent, args):
         problem, whitener = args
         whitened = whitened_residuals(start @ SE3.exp(sigma * tangent), problem, whitener)
-        return jnp.sqrt(problem.weights)[:, None] * robust_residuals(whitened)
+        return jnp.sqrt(problem.weights)[:, None] * robust_residuals(whitened, law)
 
     solution = optx.least_squares(
         residuals,
@@ -101,11 +131,11 @@ def final_solve(
     )
     motion = start @ SE3.exp(sigma * solution.value)
     finite = jnp.isfinite(motion.quat).all() & jnp.isfinite(motion.xyz).all()
-    motion = jax.tree.map(lambda new, old: jnp.where(finite, new, old), motion, start)
-    return motion, finite & (solution.result == optx.RESULTS.successful)
+    converged = finite & (solution.result == optx.RESULTS.successful)
+    return jax.tree.map(lambda new, old: jnp.where(converged, new, old), motion, start), converged
 
 
-def tangent_jacobian(motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"]) -> Float[Array, "n 3 6"]:
+def _tangent_jacobian(motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"]) -> Float[Array, "n 3 6"]:
     """Derivative of the whitened residuals by the tangent (v, ω) at the motion, [R, −R·[s]ₓ] whitened."""
     x, y, z = problem.src.T
     zero = jnp.zeros_like(x)
@@ -117,9 +147,29 @@ def tangent_jacobian(motion: SE3, problem: Problem, whitener: Float[Array, "n 3 
     return jnp.einsum("nik,nkl->nil", turned, local, precision=Precision.HIGHEST)
 
 
-def information(
-    motion: SE3, problem: Problem, whitener: Float[Array, "n 3 3"], weights: Float[Array, " n"]
-) -> Float[Array, "6 6"]:
-    """JᵀWJ of the whitened residuals at the motion, for the tangent (v, ω)."""
-    jacobian = tangent_jacobian(motion, problem, whitener)
-    return jnp.einsum("n,nij,nik->jk", weights, jacobian, jacobian, precision=Precision.HIGHEST)
+def _isotropic_equations(motion: SE3, problem: Problem, trust: Float[Array, " n"]):
+    """`normal_equations` of unit noise, from sums over the points: JᵀJ does not depend on the rotation."""
+    src = problem.src
+    local = src + jnp.matmul(motion.xyz - problem.dst, motion.rotmat(), precision=Precision.HIGHEST)
+    pairs = jnp.stack([src[:, i] * src[:, j] for i in range(3) for j in range(i, 3)], axis=-1)
+    rows = jnp.concatenate([jnp.ones_like(src[:, :1]), src, pairs, local, jnp.cross(src, local)], axis=-1)
+    sums = jnp.matmul(trust, rows, precision=Precision.HIGHEST)
+    total, (x, y, z), (xx, xy, xz, yy, yz, zz), gradient = sums[0], sums[1:4], sums[4:10], sums[10:]
+    zero = jnp.zeros_like(total)
+    upper = jnp.stack([zero, z, -y, -z, zero, x, y, -x, zero]).reshape(3, 3)
+    turn = jnp.stack([yy + zz, -xy, -xz, -xy, xx + zz, -yz, -xz, -yz, xx + yy]).reshape(3, 3)
+    shift = total * jnp.eye(3, dtype=total.dtype)
+    return jnp.block([[shift, upper], [upper.T, turn]]), gradient
+
+
+def normal_equations(
+    motion: SE3, problem: Problem, whitener: Float[Array, "*n3"], trust: Float[Array, " n"]
+) -> tuple[Float[Array, "6 6"], Float[Array, "6"]]:
+    """JᵀWJ and JᵀWr of the whitened residuals at the motion, for the tangent (v, ω)."""
+    if whitener.ndim == 0:
+        normal, gradient = _isotropic_equations(motion, problem, trust)
+        return whitener**2 * normal, whitener**2 * gradient
+    whitened = whitened_residuals(motion, problem, whitener)
+    jacobian = _tangent_jacobian(motion, problem, whitener)
+    normal = jnp.einsum("n,nij,nik->jk", trust, jacobian, jacobian, precision=Precision.HIGHEST)
+    return normal, jnp.einsum("n,nij,ni->j", trust, jacobian, whitened, precision=Precision.HIGHEST)

@@ -12,15 +12,16 @@ from ltgs_jax.geometry import SE3
 
 from .consensus import Consensus, distinction, find_consensus, find_second, vote
 from .hypotheses import BLOCK, Problem
-from .noise import narrow_bound
+from .noise import fit_law, narrow_bound
 from .outcome import RegisterConfig, Registration, Result
 from .refine import (
     BOUND_IN_SIGMA,
+    ResidualLaw,
     approach,
     final_solve,
-    information,
     inlier_probability,
     isotropic_whitener,
+    normal_equations,
     whitened_residuals,
 )
 from .scale import refine_scale, vote_scale
@@ -64,28 +65,30 @@ def lift_covariance(
 
 
 def _fit(consensus: Consensus, problem: Problem, frozen: Problem, covariances, config: RegisterConfig):
-    """Robust least squares from the consensus: motion, problem at its bound, whitener, whether it converged."""
+    """Robust least squares from the consensus: motion, problem at its bound, whitener, law, scale, convergence."""
+    law = ResidualLaw.of_bound(problem.src.dtype)
     if covariances is None:
         start, bound = narrow_bound(consensus.motions, frozen, config)
         problem, level = problem.at_bound(bound), frozen.at_bound(bound)
         whitener = isotropic_whitener(problem)
-        start = approach(start, level, isotropic_whitener(level), config.approach_steps)
     else:
         eye = jnp.broadcast_to(jnp.eye(3, dtype=problem.src.dtype), covariances.shape)
         whitener = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(covariances), eye, lower=True)
-        start = approach(consensus.motions[0], frozen, whitener, _WHITENED_STEPS)
+        start, level = approach(consensus.motions[0], frozen, whitener, law, _WHITENED_STEPS), frozen
+    held = jax.lax.stop_gradient(whitener)
     factor = jnp.ones((), problem.src.dtype)
     if config.estimate_scale:
-        level = frozen.at_bound(problem.bound)
 
         def fit(motion, scaled):
-            motion = approach(motion, scaled, whitener, config.approach_steps)
+            motion = approach(motion, scaled, whitener, law, config.approach_steps)
             return motion, scaled.weights * inlier_probability(whitened_residuals(motion, scaled, whitener))
 
         start, factor = refine_scale(start, level, fit)
-        problem = dataclasses.replace(problem, src=problem.src * factor)
-    motion, converged = final_solve(start, problem, whitener, config)
-    return motion, problem, whitener, factor, converged
+        problem, level = (dataclasses.replace(p, src=p.src * factor) for p in (problem, level))
+    law = fit_law(whitened_residuals(start, level, held), level.weights)
+    start = approach(start, level, held, law, config.approach_steps)
+    motion, converged = final_solve(start, problem, whitener, law, config)
+    return motion, problem, whitener, law, factor, converged
 
 
 def solve(
@@ -112,17 +115,18 @@ def solve(
         rows = ((0, problem.weights.size - count), (0, 0), (0, 0))
         known = (jnp.pad(weights, rows[0]) > 0)[:, None, None]
         covariances = jnp.where(known, jnp.pad(covariances, rows) / size**2, eye)
-    motion, problem, whitener, factor, converged = _fit(consensus, problem, frozen, covariances, config)
+    motion, problem, whitener, law, factor, converged = _fit(consensus, problem, frozen, covariances, config)
 
     whitened = whitened_residuals(motion, problem, whitener)
     probability = jnp.where(problem.weights > 0, inlier_probability(whitened), 0)
     inlier = (jnp.sum(whitened * whitened, axis=-1) < BOUND_IN_SIGMA**2) & (problem.weights > 0)
     squared = jnp.sum((motion.apply(problem.src) - problem.dst) ** 2, axis=-1)
     inliers, usable = jnp.sum(inlier), jnp.sum(problem.weights > 0)
-    covariance = jnp.linalg.pinv(information(motion, problem, whitener, probability * problem.weights), hermitian=True)
+    trust = problem.weights * law.trust(jnp.sum(whitened * whitened, axis=-1))
+    covariance = jnp.linalg.pinv(normal_equations(motion, problem, whitener, trust)[0], hermitian=True)
     axis = free_axis(problem, probability, config)
 
-    trust = jnp.where(usable >= 3, confidence(consensus.distinction, covariance, axis), 0)
+    sure = jnp.where(usable >= 3, confidence(consensus.distinction, covariance, axis), 0)
     result = jnp.where(converged, int(Result.SUCCESS), int(Result.NOT_CONVERGED))
     result = jnp.where(consensus.distinction < config.min_distinction, int(Result.NO_CONSENSUS), result)
     result = jnp.where(usable < 3, int(Result.TOO_FEW_POINTS), result)
@@ -145,7 +149,7 @@ def solve(
         scale=scale * factor,
         covariance=lift_covariance(covariance, scale * factor * src_centre, size),
         result=result,
-        confidence=trust,
+        confidence=sure,
         distinction=consensus.distinction,
         noise_bound=problem.bound * size,
         ambiguous_axis=axis,

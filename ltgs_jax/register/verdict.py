@@ -18,6 +18,7 @@ _EVEN, _SLOPE = 2.2, 3.0
 _ANGLE, _SHIFT = math.radians(5.0), 0.1
 # Share of the inliers, farthest from the axis, that may be there by chance.
 _CHANCE_SHARE = 0.1
+_LIKELY = 0.5
 _TRIMS = 4
 
 
@@ -56,6 +57,8 @@ def free_axis(problem: Problem, inlier: Float[Array, " n"], config: RegisterConf
     """
     tiny = jnp.finfo(inlier.dtype).tiny
     allowed = jnp.ceil(_CHANCE_SHARE * jnp.sum(inlier))
+    # Enough of them, each weighing at least `_LIKELY`, to reach what is allowed.
+    most = (_CHANCE_SHARE * inlier.size + 1) / _LIKELY + 1
 
     def spread(trusted):
         total = jnp.maximum(jnp.sum(trusted), tiny)
@@ -67,10 +70,10 @@ def free_axis(problem: Problem, inlier: Float[Array, " n"], config: RegisterConf
         return values, vectors[:, 2], jnp.sum(centred * centred, axis=1) - along**2
 
     def trim(_, trusted):
-        across = jnp.where(inlier > 0, spread(trusted)[2], -jnp.inf)
-        order = jnp.argsort(-across)
-        dropped = jnp.cumsum(inlier[order]) <= allowed
-        return inlier.at[order].multiply(1 - dropped.astype(inlier.dtype))
+        across = jnp.where(inlier > _LIKELY, spread(trusted)[2], -jnp.inf)
+        farthest, index = jax.lax.top_k(across, min(math.ceil(most), across.size))
+        dropped = jnp.sum(jnp.cumsum(inlier[index]) <= allowed)
+        return jnp.where(across > farthest[jnp.minimum(dropped, index.size - 1)], 0, inlier)
 
     values, axis, _ = spread(jax.lax.fori_loop(0, _TRIMS, trim, inlier))
     sigma = problem.bound / BOUND_IN_SIGMA
