@@ -159,7 +159,7 @@ HYPERPARAMETERS = {
     "detect.sigmas": (3.0, 5.0, 8.0),
     "detect.gamma": (0.5, 0.7, 0.9),
     "match.min_new": (0.15, 0.3, 0.6),
-    "template.tau_same": (0.2, 0.35, 0.5),
+    "template.tau_same": (0.05, 0.11, 0.2),
     "fit.long.steps": (0, 80, 200),
 }
 
