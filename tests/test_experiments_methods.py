@@ -68,6 +68,7 @@ def test_empty_slots_weigh_nothing():
     assert bytes_of(splats) == 3 * 4 * (3 + 4 + 3 + 1 + 3)
 
 
+@pytest.mark.slow
 def test_noise_moves_only_the_poses_that_methods_use(tmp_path):
     plain = read_capture(open_capture(SMALL.capture, tmp_path))
     noisy = read_capture(open_capture(dataclasses.replace(SMALL.capture, pose_noise=1.0), tmp_path))

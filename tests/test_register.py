@@ -259,6 +259,7 @@ def test_anisotropic_noise_is_weighed_by_its_covariance():
     assert np.median(informed) < 0.5 * np.median(plain)
 
 
+@pytest.mark.slow
 def test_scale_is_found_when_asked_for():
     src, dst, rotmat, *_ = problem(23, 120, 0.8)
     config = RegisterConfig(estimate_scale=True)

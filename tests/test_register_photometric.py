@@ -109,6 +109,7 @@ def test_starts_five_degrees_and_a_twentieth_of_the_size_off_converge(scene):
     assert np.all(np.asarray(fit.steps) <= PhotometricConfig().steps + 1)
 
 
+@pytest.mark.slow
 def test_failures_say_so(scene):
     """Far beside, beside the image, and where nothing counts: never a success, never a worse pose."""
     template, views = scene
