@@ -106,7 +106,8 @@ def place_arrivals(
         if found.gain * found.likeness * shape < config.template.tau_same:
             identity = state.chronology.templates[k].identity
             progress.note(
-                f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f} only"
+                f"visit {t}: arrival {i} is not object {identity}: it explains {found.gain:.2f}, likeness "
+                f"{found.likeness:.2f}, their outlines overlap by {shape:.2f}"
             )
             del placements[i, k]
     pairs = _assigned(len(arrivals), placements, config)
