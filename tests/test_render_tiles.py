@@ -14,7 +14,7 @@ from render_scenes import make_camera, make_splats
 from ltgs_jax.render import RenderConfig, gather_tiles, plan_render, render, scatter_tiles, tiles_of_mask
 from ltgs_jax.render.binning import bin_splats
 from ltgs_jax.render.grid import Grid
-from ltgs_jax.render.plan import project_batch
+from ltgs_jax.render.project import project_splats
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def test_each_splat_is_in_just_the_tiles_that_it_reaches():
     splats, camera = make_splats(200, seed=5, scale=0.08), make_camera(61, 43)
     grid = Grid(61, 43, 8, 1)
     cameras = jax.tree.map(lambda leaf: leaf[None], camera)
-    projected = jax.jit(lambda s, c: project_batch(s, c, near=0.01))(splats, cameras)
+    projected = jax.jit(lambda s, c: project_splats(s, c, near=0.01))(splats, cameras)
     bins = jax.jit(lambda p: bin_splats(p, grid, 4096))(projected)
     assert int(bins.overflow) == 0
     listed = np.zeros((grid.count, splats.count), bool)

@@ -7,6 +7,7 @@ from .se3 import multiply_quats as multiply_quats
 from .se3 import normalize_quats as normalize_quats
 from .se3 import quat_from_rotmat as quat_from_rotmat
 from .se3 import rotation_angle as rotation_angle
+from .se3 import rotmat_entries as rotmat_entries
 from .se3 import rotmat_from_quat as rotmat_from_quat
 from .sh import C0 as C0
 from .sh import eval_sh as eval_sh

@@ -7,33 +7,40 @@ from jax.lax import Precision
 from jaxtyping import Array, Float
 
 
-def _safe_norm(x: Float[Array, "... d"]) -> Float[Array, "... 1"]:
-    """Norm along the last axis whose gradient at 0 is 0 (double where)."""
-    squared = jnp.sum(x * x, axis=-1, keepdims=True)
-    positive = squared > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+def _unit(w: Array, x: Array, y: Array, z: Array) -> tuple[Array, ...]:
+    """Components of `normalize_quats`, elementwise."""
+    # Scaling by the largest component first keeps float32 from over- or underflowing in the squares.
+    largest = jax.lax.stop_gradient(jnp.maximum(jnp.maximum(abs(w), abs(x)), jnp.maximum(abs(y), abs(z))))
+    usable = largest > 0
+    safe = jnp.where(usable, largest, 1)
+    w, x, y, z = jnp.where(usable, w / safe, 1), *(jnp.where(usable, v / safe, 0) for v in (x, y, z))
+    shrink = 1 / jnp.sqrt(w * w + x * x + y * y + z * z)
+    return w * shrink, x * shrink, y * shrink, z * shrink
 
 
 def normalize_quats(quats: Float[Array, "... 4"]) -> Float[Array, "... 4"]:
     """Unit quaternions; a zero quaternion becomes the identity, with zero gradient there."""
-    # Scaling by the largest component first keeps float32 from over- or underflowing in the squares.
-    largest = jnp.max(jnp.abs(quats), axis=-1, keepdims=True)
-    usable = largest > 0
-    scaled = quats / jnp.where(usable, jax.lax.stop_gradient(largest), 1)
-    scaled = jnp.where(usable, scaled, jnp.zeros_like(quats).at[..., 0].set(1))
-    return scaled / _safe_norm(scaled)
+    return jnp.stack(_unit(*jnp.moveaxis(quats, -1, 0)), axis=-1)
+
+
+def rotmat_entries(w: Array, x: Array, y: Array, z: Array) -> list[list[Array]]:
+    """The nine entries, row by row, of the rotation matrices of wxyz quaternions, which need not be unit.
+
+    Elementwise in arrays of any one shape: many times faster on CPUs than arithmetic along a short last axis.
+    """
+    w, x, y, z = _unit(w, x, y, z)
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 @jax.jit
 def rotmat_from_quat(quats: Float[Array, "... 4"]) -> Float[Array, "... 3 3"]:
     """Rotation matrices of wxyz quaternions, which need not be unit."""
-    w, x, y, z = jnp.moveaxis(normalize_quats(quats), -1, 0)
-    rows = [
-        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], axis=-1),
-        jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], axis=-1),
-        jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=-1),
-    ]
-    return jnp.stack(rows, axis=-2)
+    rows = rotmat_entries(*jnp.moveaxis(quats, -1, 0))
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 @jax.jit

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt
+from jaxtyping import Array, Bool, Float, Int, UInt
 
 from .grid import Grid, drop_inactive, tile_boxes
 from .project import Projected
@@ -50,18 +50,14 @@ def _low_word(packed: UInt[Array, " m"]) -> Int[Array, " m"]:
     return (packed & jnp.uint64(0xFFFFFFFF)).astype(jnp.uint32).astype(jnp.int32)
 
 
-def _reaches(
-    projected: Projected, splat: Int[Array, " i"], corner: Float[Array, "i 2"], grid: Grid
-) -> Int[Array, " i"]:
-    """Whether the ellipse α ≥ 1/255 of a splat meets the pixel centres' rectangle of a tile.
+def _reaches(facts: Float[Array, "i 6"], corner: tuple[Float[Array, " i"], ...], side: int) -> Bool[Array, " i"]:
+    """Whether the ellipse α ≥ 1/255 of a splat meets the pixel centres' rectangle of a tile of `side` pixels.
 
     The exponent is convex: outside of the rectangle its minimum lies on one of the two edges that face the centre.
     """
-    columns = [projected.inverse_a, projected.slope, projected.inverse_b, projected.reach]
-    table = jax.lax.stop_gradient(jnp.concatenate([projected.means2d, jnp.stack(columns, axis=-1)], axis=-1))[splat]
-    mean_x, mean_y, inverse_a, slope, inverse_b, reach = (table[:, j] for j in range(6))
-    x0, y0 = corner[:, 0] + 0.5 - mean_x, corner[:, 1] + 0.5 - mean_y
-    x1, y1 = x0 + (grid.tile_size - 1), y0 + (grid.tile_size - 1)
+    mean_x, mean_y, inverse_a, slope, inverse_b, reach = (facts[:, j] for j in range(6))
+    x0, y0 = corner[0] + 0.5 - mean_x, corner[1] + 0.5 - mean_y
+    x1, y1 = x0 + (side - 1), y0 + (side - 1)
     near_x, near_y = jnp.clip(0, x0, x1), jnp.clip(0, y0, y1)
 
     def exponent(dx, dy):
@@ -84,9 +80,11 @@ def bin_splats(projected: Projected, grid: Grid, capacity: int, active: Int[Arra
     if m == 0:
         empty = jnp.zeros(grid.count, jnp.int32)
         return Bins(jnp.zeros(1, jnp.int32), empty, empty, jnp.zeros((), jnp.int32))
+    projected = jax.lax.stop_gradient(projected)
     order = depth_order(projected)
+    rank = jnp.zeros(m, jnp.int32).at[order].set(jnp.arange(m, dtype=jnp.int32), unique_indices=True)
     boxes = tile_boxes(projected, grid)
-    boxes = (boxes if active is None else drop_inactive(boxes, grid, active))[order]
+    boxes = boxes if active is None else drop_inactive(boxes, grid, active)
     wide, high = boxes[:, 2] - boxes[:, 0], boxes[:, 3] - boxes[:, 1]
     with jax.enable_x64(True):
         counts = (wide * high).astype(jnp.int64)
@@ -95,24 +93,37 @@ def bin_splats(projected: Projected, grid: Grid, capacity: int, active: Int[Arra
         begins = jnp.minimum(ends - counts, capacity).astype(jnp.int32)
         overflow = jnp.clip(total - capacity, 0, 2**31 - 1).astype(jnp.int32)
         total = jnp.minimum(total, capacity).astype(jnp.int32)
-    # Slot i belongs to the last splat that begins at or before it: count the beginnings.
-    marks = jnp.zeros(capacity + 1, jnp.int32).at[begins].add(1)
-    rank = jnp.cumsum(marks[:capacity]) - 1
-    slot = jnp.arange(capacity, dtype=jnp.int32)
-    facts = jnp.concatenate([boxes[:, :2], wide[:, None], begins[:, None], order[:, None]], axis=-1)[rank]
-    local = slot - facts[:, 3]
-    width = jnp.maximum(facts[:, 2], 1)
-    column, row = facts[:, 0] + local % width, facts[:, 1] + local // width
-    corner = jnp.stack([column, row], axis=-1).astype(projected.means2d.dtype) * grid.tile_size
-    splat = facts[:, 4]
-    tile = splat // (m // grid.cameras) * grid.per_camera + row * grid.columns + column
-    wanted = (slot < total) & _reaches(projected, splat, corner, grid)
-    if active is not None:
-        wanted &= active[jnp.clip(tile, 0, grid.count - 1)] != 0
-    tile = jnp.where(wanted, tile, grid.count)
-    with jax.enable_x64(True):
-        word = jnp.uint32 if (grid.count + 1) * m < 2**32 else jnp.uint64
-        keys = jnp.sort(tile.astype(word) * word(m) + rank.astype(word))
-        edges = jnp.searchsorted(keys, jnp.arange(grid.count + 1, dtype=word) * word(m)).astype(jnp.int32)
-        splats = order[(keys % word(m)).astype(jnp.int32)]
+    box_table = jnp.stack([boxes[:, 0], boxes[:, 1], wide, begins, rank], axis=-1)
+    shape = jnp.stack([projected.inverse_a, projected.slope, projected.inverse_b, projected.reach], axis=-1)
+    shape_table = jnp.concatenate([projected.means2d, shape], axis=-1)
+
+    def sort_pairs(order, begins, box_table, shape_table):
+        # Candidate pairs, splat by splat, so that all tables are read in order: slot i belongs to the last splat that
+        # begins at or before it; count the beginnings.
+        marks = jnp.zeros(capacity + 1, jnp.int32).at[begins].add(1)
+        splat = jnp.cumsum(marks[:capacity]) - 1
+        slot = jnp.arange(capacity, dtype=jnp.int32)
+        left, top, width, begin, rank = (column[:, 0] for column in jnp.split(box_table[splat], 5, axis=-1))
+        local, width = slot - begin, jnp.maximum(width, 1)
+        row = local // width
+        column, row = left + local - row * width, top + row
+        tile = splat // (m // grid.cameras) * grid.per_camera + row * grid.columns + column
+        corner = tuple(x.astype(shape_table.dtype) * grid.tile_size for x in (column, row))
+        wanted = (slot < total) & _reaches(shape_table[splat], corner, grid.tile_size)
+        if active is not None:
+            wanted &= active[jnp.clip(tile, 0, grid.count - 1)] != 0
+        tile = jnp.where(wanted, tile, grid.count)
+        with jax.enable_x64(True):
+            word = jnp.uint32 if (grid.count + 1) * m < 2**32 else jnp.uint64
+            keys = jnp.sort(tile.astype(word) * word(m) + rank.astype(word))
+            edges = jnp.searchsorted(keys, jnp.arange(grid.count + 1, dtype=word) * word(m)).astype(jnp.int32)
+            splats = order[(keys % word(m)).astype(jnp.int32)]
+        return splats, edges
+
+    def no_pairs(*_):
+        return jnp.zeros(capacity, jnp.int32), jnp.zeros(grid.count + 1, jnp.int32)
+
+    # The branch also keeps XLA from fusing the tables into their gathers, which would compute every entry anew for every
+    # pair.
+    splats, edges = jax.lax.cond(total > 0, sort_pairs, no_pairs, order, begins, box_table, shape_table)
     return Bins(splats, edges[:-1], edges[1:] - edges[:-1], overflow)

@@ -1,9 +1,7 @@
 """Front-to-back blending of tiles, with its pushforward and its pull-back."""
 
-import dataclasses
 import functools
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,29 +9,7 @@ from jax.lax import Precision
 from jaxtyping import Array, Float, Int
 
 from .config import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_STOP
-
-SHAPE_FORMS = 6  # p0, p1, q0, q1, q2, opacity; the blended channels follow
-GROUP = 4  # splats of a round are scanned in groups of this many
-
-
-@dataclasses.dataclass(frozen=True)
-class Schedule:
-    """Static sizes of the blending loops: tiles are taken in blocks, a block advances `chunk` splats per round.
-
-    `rounds` is the capacity over all blocks.
-    """
-
-    tile_size: int
-    chunk: int
-    tiles_per_block: int
-    rounds: int
-
-
-class Blocks(eqx.Module):
-    """First round and number of rounds of each block of tiles."""
-
-    offsets: Int[Array, " b"]
-    limits: Int[Array, " b"]
+from .slots import Schedule, Slots, channel_count, round_forms
 
 
 def _pixel_offsets(tile_size: int, dtype) -> tuple[np.ndarray, np.ndarray]:
@@ -42,10 +18,10 @@ def _pixel_offsets(tile_size: int, dtype) -> tuple[np.ndarray, np.ndarray]:
     return np.tile(side, tile_size).astype(dtype), np.repeat(side, tile_size).astype(dtype)
 
 
-def _alphas(forms: Float[Array, "f t q g"], tile_size: int) -> Float[Array, "t q g p"]:
+def _alphas(shape: tuple[Float[Array, "t q g"], ...], tile_size: int) -> Float[Array, "t q g p"]:
     """α of every splat of a round at every pixel of its tile, 0 where skipped; splats in q groups of g."""
-    p0, p1, q0, q1, q2, opacity = (forms[j][..., None] for j in range(SHAPE_FORMS))
-    x, y = _pixel_offsets(tile_size, forms.dtype)
+    p0, p1, q0, q1, q2, opacity = (form[..., None] for form in shape)
+    x, y = _pixel_offsets(tile_size, opacity.dtype)
     p, q = p0 + p1 * x, q0 + q1 * x + q2 * y
     alpha = jnp.minimum(opacity * jnp.exp(-0.5 * (p * p + q * q)), ALPHA_MAX)
     return _kept(jnp.where(alpha >= ALPHA_MIN, alpha, 0))
@@ -56,35 +32,43 @@ def _kept(x: Array) -> Array:
     return jax.lax.optimization_barrier(x)
 
 
-def _scanned(x: Float[Array, "t q g p"], start: Float[Array, "t p"], reverse: bool, combine, neutral: float):
-    """Exclusive scan over the splats of a round from `start`, as masked reductions.
+def _dimmed(transmittance: Array, alpha: Array) -> Array:
+    """Transmittance behind a splat."""
+    return transmittance * (1 - alpha)
 
+
+def _scanned(x: Float[Array, "t q g p"], start: Float[Array, "t p"], reverse: bool, step, unit: float):
+    """Exclusive scan step(…step(start, x_0)…, x_k−1) over the splats of a round, as masked reductions.
+
+    `unit` is the start from which a group's own steps are taken to be applied as one; an x of 0 must change nothing.
     Each element reads those before it (after it, in reverse) in its group, and the groups before: some eight reads that
     vectorise over pixels, where a true scan along a short axis does not (fact 9 of the conventions).
     """
     groups, members = x.shape[1:3]
-    whole = _kept(functools.reduce(combine, [x[:, :, j] for j in range(members)]))
+    whole = functools.reduce(step, [x[:, :, j] for j in range(members)], jnp.asarray(unit, x.dtype))
+    whole = _kept(jnp.broadcast_to(whole, (x.shape[0], groups, x.shape[3])))
+    join = jnp.multiply if unit else jnp.add
     ahead = jnp.broadcast_to(start[:, None], whole.shape)
     index = jnp.arange(groups)[None, :, None]
     for j in range(groups):
-        ahead = combine(ahead, jnp.where(index < j if reverse else index > j, whole[:, j : j + 1], neutral))
+        ahead = join(ahead, jnp.where(index < j if reverse else index > j, whole[:, j : j + 1], unit))
     ahead = _kept(ahead)[:, :, None]
     index = jnp.arange(members)[None, None, :, None]
     for j in range(members):
-        ahead = combine(ahead, jnp.where(index < j if reverse else index > j, x[:, :, j : j + 1], neutral))
+        ahead = step(ahead, jnp.where(index < j if reverse else index > j, x[:, :, j : j + 1], 0))
     return ahead
 
 
 def _weights(alphas: Float[Array, "t q g p"], start: Float[Array, "t p"]) -> Float[Array, "t q g p"]:
     """Weights αT of a round that begins with transmittance `start`."""
-    transmittance = _scanned(1 - alphas, start, False, jnp.multiply, 1)
+    transmittance = _scanned(alphas, start, False, _dimmed, 1)
     return _kept(jnp.where(transmittance > TRANSMITTANCE_STOP, alphas * transmittance, 0))
 
 
 def _passed(alphas: Float[Array, "t q g p"], transmittance: Float[Array, "t p"]) -> Float[Array, "t p"]:
     """Transmittance after a round; frozen by the first splat that takes it to the stop."""
     for i, j in np.ndindex(alphas.shape[1:3]):
-        after = transmittance * (1 - alphas[:, i, j])
+        after = _dimmed(transmittance, alphas[:, i, j])
         transmittance = jnp.where(transmittance > TRANSMITTANCE_STOP, after, transmittance)
     return transmittance
 
@@ -99,11 +83,11 @@ def _flat(x: Float[Array, "t q g *rest"]) -> Float[Array, "t k *rest"]:
     return x.reshape(x.shape[0], -1, *x.shape[3:])
 
 
-def _blend(schedule: Schedule, forms, blocks: Blocks, keep_states: bool):
+def _blend(schedule: Schedule, table, slots: Slots, keep_states: bool):
     """Blend all blocks; with `keep_states` also the transmittance before every round and the rounds done."""
     tiles, pixels = schedule.tiles_per_block, schedule.tile_size**2
-    channels = forms.shape[1] - SHAPE_FORMS
-    states = jnp.ones((schedule.rounds if keep_states else 1, tiles, pixels), forms.dtype)
+    blocks = slots.blocks
+    states = jnp.ones((schedule.rounds if keep_states else 1, tiles, pixels), table.dtype)
 
     def block_step(states, block):
         def going(carry):
@@ -115,14 +99,15 @@ def _blend(schedule: Schedule, forms, blocks: Blocks, keep_states: bool):
             place = blocks.offsets[block] + round_index
             if keep_states:
                 states = jax.lax.dynamic_update_index_in_dim(states, transmittance, place, 0)
-            row = jax.lax.dynamic_index_in_dim(forms, place, keepdims=False)
-            alphas = _alphas(row, schedule.tile_size)
+            index, centres = _at(slots, place)
+            shape, channels = _kept(round_forms(table[index], centres))
+            alphas = _alphas(shape, schedule.tile_size)
             weights = _weights(alphas, transmittance)
-            totals = tuple(total + _blended(weights, row[j]) for j, total in enumerate(totals, SHAPE_FORMS))
+            totals = tuple(total + _blended(weights, ch) for total, ch in zip(totals, channels, strict=True))
             return round_index + 1, _passed(alphas, transmittance), totals, states
 
-        clear = jnp.ones((tiles, pixels), forms.dtype)
-        nothing = (jnp.zeros_like(clear),) * channels
+        clear = jnp.ones((tiles, pixels), table.dtype)
+        nothing = (jnp.zeros_like(clear),) * channel_count(table)
         first = jnp.zeros((), jnp.int32)
         done, transmittance, totals, states = jax.lax.while_loop(going, advance, (first, clear, nothing, states))
         return states, (totals, transmittance, done)
@@ -132,14 +117,19 @@ def _blend(schedule: Schedule, forms, blocks: Blocks, keep_states: bool):
     return (totals, transmittance), (states, done)
 
 
-def _pull_back(schedule: Schedule, forms, blocks: Blocks, states, done, final, cotangents):
-    """Gradient of the forms: blocks again, their rounds from back to front.
+def _at(slots: Slots, place: Int[Array, ""]) -> tuple[Int[Array, "t k"], Float[Array, "t 2"]]:
+    """Splats and tile centres of one round."""
+    return tuple(jax.lax.dynamic_index_in_dim(x, place, keepdims=False) for x in (slots.index, slots.centres))
+
+
+def _pull_back(schedule: Schedule, table, slots: Slots, states, done, final, cotangents):
+    """Gradient of the table: blocks again, their rounds from back to front.
 
     With e_k = c_k·∂L/∂C and S_k = Σ_{j>k} w_j e_j + T_end ∂L/∂T_end, ∂L/∂α_k = T_k e_k − S_k / (1 − α_k). What reaches
     p and q are the moments of ∂L/∂σ = −α ∂L/∂α over the tile's pixels, a product with one fixed matrix.
     """
     totals_ct, transmittance_ct = cotangents
-    x, y = _pixel_offsets(schedule.tile_size, forms.dtype)
+    x, y = _pixel_offsets(schedule.tile_size, table.dtype)
     monomials = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
 
     def block_step(gradient, block):
@@ -149,11 +139,13 @@ def _pull_back(schedule: Schedule, forms, blocks: Blocks, states, done, final, c
         def retreat(carry):
             round_index, behind, gradient = carry
             round_index = round_index - 1
-            place = blocks.offsets[block] + round_index
-            row = jax.lax.dynamic_index_in_dim(forms, place, keepdims=False)
-            alphas = _alphas(row, schedule.tile_size)
+            place = slots.blocks.offsets[block] + round_index
+            index, centres = _at(slots, place)
+            forms, pull = jax.vjp(lambda rows: round_forms(rows, centres), table[index])
+            shape, channels = _kept(forms)
+            alphas = _alphas(shape, schedule.tile_size)
             weights = _weights(alphas, jax.lax.dynamic_index_in_dim(states, place, keepdims=False))
-            worth = sum(row[j][..., None] * ct[:, None, None] for j, ct in enumerate(cotangent, SHAPE_FORMS))
+            worth = sum(ch[..., None] * ct[:, None, None] for ch, ct in zip(channels, cotangent, strict=True))
             worth = _kept(weights * worth)
             remaining = _scanned(worth, behind, True, jnp.add, 0)
             active = (weights > 0) & (alphas < ALPHA_MAX)
@@ -161,31 +153,32 @@ def _pull_back(schedule: Schedule, forms, blocks: Blocks, states, done, final, c
             behind = behind + sum(worth[:, i, j] for i, j in np.ndindex(worth.shape[1:3]))
             channel_ct = jnp.einsum("tkp,tcp->ctk", _flat(weights), stacked_ct, precision=Precision.HIGHEST)
             moments = jnp.matmul(_flat(pulls), monomials, precision=Precision.HIGHEST)
-            row_ct = jnp.concatenate([_shape_gradient(row, moments), channel_ct.reshape(-1, *row.shape[1:])])
-            return round_index, behind, jax.lax.dynamic_update_index_in_dim(gradient, row_ct, place, 0)
+            channel_ct = tuple(channel_ct.reshape(-1, *channels[0].shape))
+            (rows_ct,) = pull((_shape_gradient(shape, moments), channel_ct))
+            return round_index, behind, gradient.at[index].add(rows_ct)
 
         behind = final[block] * transmittance_ct[block]
         carry = jax.lax.while_loop(lambda carry: carry[0] > 0, retreat, (done[block], behind, gradient))
         return carry[2], None
 
-    return jax.lax.scan(block_step, jnp.zeros_like(forms), jnp.arange(done.shape[0], dtype=jnp.int32))[0]
+    return jax.lax.scan(block_step, jnp.zeros_like(table), jnp.arange(done.shape[0], dtype=jnp.int32))[0]
 
 
-def _shape_gradient(row: Float[Array, "f t q g"], moments: Float[Array, "t k 6"]) -> Float[Array, "6 t q g"]:
+def _shape_gradient(
+    shape: tuple[Float[Array, "t q g"], ...], moments: Float[Array, "t k 6"]
+) -> tuple[Float[Array, "t q g"], ...]:
     """From the moments of ∂L/∂σ, σ = ½(p² + q²), to p0, p1, q0, q1, q2 and the opacity."""
-    p0, p1, q0, q1, q2, opacity = (row[j] for j in range(SHAPE_FORMS))
+    p0, p1, q0, q1, q2, opacity = shape
     one, x, y, xx, xy, yy = (moments[..., j].reshape(p0.shape) for j in range(6))
     # α = opacity·exp(−σ): ∂L/∂opacity = Σ ∂L/∂α·α / opacity; an empty slot has opacity 0 and no moments.
-    opacity_ct = -one / jnp.maximum(opacity, jnp.finfo(row.dtype).tiny)
-    return jnp.stack(
-        [
-            p0 * one + p1 * x,
-            p0 * x + p1 * xx,
-            q0 * one + q1 * x + q2 * y,
-            q0 * x + q1 * xx + q2 * xy,
-            q0 * y + q1 * xy + q2 * yy,
-            opacity_ct,
-        ]
+    opacity_ct = -one / jnp.maximum(opacity, jnp.finfo(opacity.dtype).tiny)
+    return (
+        p0 * one + p1 * x,
+        p0 * x + p1 * xx,
+        q0 * one + q1 * x + q2 * y,
+        q0 * x + q1 * xx + q2 * xy,
+        q0 * y + q1 * xy + q2 * yy,
+        opacity_ct,
     )
 
 
@@ -225,30 +218,28 @@ def _linear_map(push, pull, tangent, like, guard):
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def composite(
-    schedule: Schedule, forms: Float[Array, "r f t q g"], blocks: Blocks
+    schedule: Schedule, table: Float[Array, "m f"], slots: Slots
 ) -> tuple[tuple[Float[Array, "b t p"], ...], Float[Array, "b t p"]]:
     """Blended channels, one array each, and final transmittance of every pixel of every tile of every block.
 
-    `forms` [round, form, tile, group, splat] holds what a splat is to a tile: at offset (x, y) from the tile's centre
-    its exponent is −½(p² + q²) with p = p0 + p1·x and q = q0 + q1·x + q2·y; then its opacity and its channels.
-    Relative to the tile's centre p and q stay small wherever α ≥ 1/255, so that neither they nor the moments of the
-    gradient cancel. Empty slots have opacity 0.
+    Rows of the `table` of splats are gathered round by round, and their gradients scattered likewise: laid out for all
+    rounds at once they would be most of a program's memory.
 
-    Differentiable in `forms` both ways: forward mode runs the tangents through the same loops, reverse mode runs the
+    Differentiable in `table` both ways: forward mode runs the tangents through the same loops, reverse mode runs the
     rounds again from the back, with the transmittance saved at the start of each.
     """
-    return _blend(schedule, forms, blocks, keep_states=False)[0]
+    return _blend(schedule, table, slots, keep_states=False)[0]
 
 
 @composite.defjvp
 def _composite_jvp(schedule: Schedule, primals, tangents):
-    forms, blocks = primals
-    out, (states, done) = _blend(schedule, forms, blocks, keep_states=True)
+    table, slots = primals
+    out, (states, done) = _blend(schedule, table, slots, keep_states=True)
 
-    def push(forms_dot):
-        return jax.jvp(lambda forms: _blend(schedule, forms, blocks, keep_states=False)[0], (forms,), (forms_dot,))[1]
+    def push(table_dot):
+        return jax.jvp(lambda table: _blend(schedule, table, slots, keep_states=False)[0], (table,), (table_dot,))[1]
 
     def pull(cotangents):
-        return _pull_back(schedule, forms, blocks, states, done, out[1], cotangents)
+        return _pull_back(schedule, table, slots, states, done, out[1], cotangents)
 
-    return out, _linear_map(push, pull, tangents[0], out, _first_order_only(forms))
+    return out, _linear_map(push, pull, tangents[0], out, _first_order_only(table))

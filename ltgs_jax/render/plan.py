@@ -6,14 +6,14 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
 from .config import RenderConfig, RenderPlan
 from .grid import Grid, count_boxes, drop_inactive, tile_boxes
-from .project import Projected, project_splats
+from .project import project_splats
 from .slots import block_rounds, tiles_per_block
 
 # Plans made so far by the kind of program: reusing one saves a compilation, and the result does not depend on it.
@@ -45,14 +45,6 @@ def batch_of(camera: Camera) -> Camera:
     return camera if camera.K.ndim == 3 else jax.tree.map(lambda leaf: leaf[None], camera)
 
 
-def project_batch(
-    splats: Splats, cameras: Camera, *, near: float, colors: Float[Array, "n ch"] | None = None
-) -> Projected:
-    """Project into every camera; the fields of camera i are rows i·n … (i+1)·n."""
-    projected = jax.vmap(lambda camera: project_splats(splats, camera, near=near, colors=colors))(cameras)
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), projected)
-
-
 def _round_up(count: float, least: int) -> int:
     """The next of the sizes 4, 5, 6, 7 times a power of two: few sizes, few compilations."""
     count = max(least, math.ceil(count))
@@ -63,7 +55,7 @@ def _round_up(count: float, least: int) -> int:
 @functools.partial(jax.jit, static_argnames=("config",))
 def _count(splats: Splats, cameras: Camera, tiles, *, config: RenderConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """Pairs of splat and tile by bounding box, and the rounds that they need: upper bounds of what rendering finds."""
-    projected = jax.lax.stop_gradient(project_batch(splats, cameras, near=config.near))
+    projected = jax.lax.stop_gradient(project_splats(splats, cameras, near=config.near))
     grid = Grid(cameras.width, cameras.height, config.tile_size, cameras.K.shape[0])
     boxes = tile_boxes(projected, grid)
     chosen = None

@@ -10,11 +10,12 @@ from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
 from .binning import bin_splats
-from .composite import Schedule, composite
+from .composite import composite
 from .config import RenderConfig, RenderOutput, RenderPlan
 from .grid import Grid
-from .plan import batch_of, plan_render, project_batch
-from .slots import lay_out, make_forms, make_table, tiles_per_block
+from .plan import batch_of, plan_render
+from .project import project_splats
+from .slots import Schedule, lay_out, make_table, tiles_per_block
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "config"))
@@ -29,10 +30,10 @@ def _render_planned(splats, cameras, background, tiles, colors, *, plan: RenderP
         tiles_per_block=tiles_per_block(config, grid.count if chosen is None else chosen.shape[0]),
         rounds=plan.rounds,
     )
-    projected = project_batch(splats, cameras, near=config.near, colors=colors)
+    projected = project_splats(splats, cameras, near=config.near, colors=colors)
     bins = bin_splats(projected, grid, plan.intersections, active)
     slots = lay_out(bins, grid, chosen, schedule, projected.depths.shape[0], dtype)
-    totals, transmittance = composite(schedule, make_forms(make_table(projected), slots), slots.blocks)
+    totals, transmittance = composite(schedule, make_table(projected), slots)
 
     def unblocked(values):
         values = values.reshape(-1, values.shape[-1])[: slots.order.shape[0]]
@@ -41,9 +42,11 @@ def _render_planned(splats, cameras, background, tiles, colors, *, plan: RenderP
 
     *totals, total_depth = (unblocked(total) for total in totals)
     transmittance = unblocked(transmittance)
-    image = jnp.stack(totals, axis=-1)
     if background is not None:
-        image = image + transmittance[..., None] * background.astype(dtype)
+        # Channel by channel: the transpose of one product with [ch] is a sum along a short axis, slow on CPUs.
+        background = background.astype(dtype)
+        totals = [total + transmittance * background[j] for j, total in enumerate(totals)]
+    image = jnp.stack(totals, axis=-1)
     alpha = 1 - transmittance
     covered = alpha > 0
     depth = jnp.where(covered, total_depth / jnp.where(covered, alpha, 1), 0)

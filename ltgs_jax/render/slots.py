@@ -1,15 +1,39 @@
 """Splats of every tile laid out in rounds, as the compositor takes them."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from .binning import Bins
-from .composite import GROUP, Blocks, Schedule
 from .config import RenderConfig
 from .grid import Grid
 from .project import Projected
+
+TABLE_SHAPE = 8  # columns of a table before its channels: mean, remainder, inverse_a, slope, inverse_b, opacity
+GROUP = 4  # splats of a round are scanned in groups of this many
+
+
+@dataclasses.dataclass(frozen=True)
+class Schedule:
+    """Static sizes of the blending loops: tiles are taken in blocks, a block advances `chunk` splats per round.
+
+    `rounds` is the capacity over all blocks.
+    """
+
+    tile_size: int
+    chunk: int
+    tiles_per_block: int
+    rounds: int
+
+
+class Blocks(eqx.Module):
+    """First round and number of rounds of each block of tiles."""
+
+    offsets: Int[Array, " b"]
+    limits: Int[Array, " b"]
 
 
 class Slots(eqx.Module):
@@ -81,15 +105,26 @@ def make_table(projected: Projected) -> Float[Array, "m f"]:
     return jnp.pad(jnp.concatenate(columns, axis=-1), ((0, 1), (0, 0)))
 
 
-def make_forms(table: Float[Array, "m f"], slots: Slots) -> Float[Array, "r f t q g"]:
-    """Rows of the table as `composite` wants them, the exponent's forms relative to each tile's centre."""
-    rounds, tiles, chunk = slots.index.shape
+def channel_count(table: Float[Array, "m f"]) -> int:
+    """Blended channels of a table, the depth among them."""
+    return table.shape[1] - TABLE_SHAPE
+
+
+def round_forms(
+    rows: Float[Array, "t k f"], centres: Float[Array, "t 2"]
+) -> tuple[tuple[Float[Array, "t q g"], ...], tuple[Float[Array, "t q g"], ...]]:
+    """What the splats of a round, rows of the table, are to their tiles: the forms of the exponent and the opacity,
+    (p0, p1, q0, q1, q2, opacity), and the channels; splats in q groups of `GROUP`.
+
+    At offset (x, y) from the tile's centre the exponent is −½(p² + q²) with p = p0 + p1·x and q = q0 + q1·x + q2·y.
+    Relative to the tile's centre p and q stay small wherever α ≥ 1/255, so that neither they nor the moments of the
+    gradient cancel. Empty slots have opacity 0.
+    """
     # Split, not indexed: the transpose of a split is one concatenation, that of an index a padded array per column.
-    columns = [column[..., 0] for column in jnp.split(table[slots.index], table.shape[1], axis=-1)]
-    mean_x, mean_y, rest_x, rest_y, inverse_a, slope, inverse_b, *others = columns
+    columns = [column.reshape(rows.shape[0], -1, GROUP) for column in jnp.split(rows, rows.shape[-1], axis=-1)]
+    mean_x, mean_y, rest_x, rest_y, inverse_a, slope, inverse_b, opacity, *channels = columns
     # The remainder comes last: the difference before it is exact near the splat.
-    dx = (slots.centres[..., 0, None] - mean_x) - rest_x
-    dy = (slots.centres[..., 1, None] - mean_y) - rest_y
+    dx = (centres[:, 0, None, None] - mean_x) - rest_x
+    dy = (centres[:, 1, None, None] - mean_y) - rest_y
     p0, q0 = dx * inverse_a, (dy - slope * dx) * inverse_b
-    forms = [p0, inverse_a, q0, -slope * inverse_b, inverse_b, *others]
-    return jnp.stack(forms, axis=1).reshape(rounds, -1, tiles, chunk // GROUP, GROUP)
+    return (p0, inverse_a, q0, -slope * inverse_b, inverse_b, opacity), tuple(channels)
