@@ -154,11 +154,33 @@ def bench(name: str, splats, camera, colors, background, target, *, config: Rend
         "intersections": plan.intersections,
     }
     if reference:
+        row["gradient_min_cosine"] = gradient_cosine(splats, camera, colors, background, target, config)
         error = np.abs(np.asarray(image, np.float64) - paint(splats, camera, colors, background)).max(axis=-1)
         row["image_max_error"] = float(error.max())
         row["pixels_beyond_2e-5"] = int((error > 2e-5).sum())
         row["image_mean_error"] = float(error.mean())
     return row
+
+
+def gradient_cosine(splats, camera, colors, background, target, config: RenderConfig) -> float:
+    """Least cosine between float32 and float64 gradients, over means, quats, log-scales, logit-opacities, colours."""
+
+    def gradients(splats, camera, colors, background, target):
+        plan = plan_render(splats, camera, config=config, slack=1)
+
+        def loss(splats, colors):
+            output = render(splats, camera, background=background, colors=colors, plan=plan, config=config)
+            return jnp.mean(jnp.abs(output.image - target))
+
+        found, of_colors = jax.jit(jax.grad(loss, argnums=(0, 1)))(splats, colors)
+        lanes = (found.means, found.quats, found.log_scales, found.logit_opacities, of_colors)
+        return [np.asarray(lane, np.float64).ravel() for lane in lanes]
+
+    inputs = (splats, camera, colors, background, target)
+    single = gradients(*inputs)
+    with jax.enable_x64(True):
+        double = gradients(*jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float64)), inputs))
+    return min(float(a @ b / np.sqrt((a @ a) * (b @ b))) for a, b in zip(single, double, strict=True))
 
 
 def subsample(splats: Splats, colors, count: int, factor: float) -> tuple[Splats, jax.Array]:
@@ -181,9 +203,10 @@ def growth(path: Path, config: RenderConfig) -> list[dict]:
     splats, camera, colors, background, _ = load_workload(path)
     rows = []
 
-    def add(name, splats, colors, camera):
+    def add(name, splats, colors, camera, **driver):
         target = jnp.zeros((camera.height, camera.width, 3))
-        rows.append(bench(name, splats, camera, colors, background, target, config=config, reference=False))
+        row = bench(name, splats, camera, colors, background, target, config=config, reference=False)
+        rows.append(row | driver)
 
     for count in (10_000, 30_000, 100_000, 300_000, 1_000_000):
         add("splats", *subsample(splats, colors, count, (splats.count / count) ** 0.5), camera)
@@ -191,7 +214,7 @@ def growth(path: Path, config: RenderConfig) -> list[dict]:
     for width in (160, 320, 640, 1280):
         add("pixels", some, some_colors, camera.resized(width, width * camera.height // camera.width))
     for factor in (0.5, 1.0, 2.0, 4.0):
-        add("overdraw", *subsample(splats, colors, 50_000, factor), camera.resized(320, 240))
+        add("overdraw", *subsample(splats, colors, 50_000, factor), camera.resized(320, 240), covered_area=factor**2)
     return rows
 
 
@@ -211,7 +234,7 @@ def plot(rows: list[dict], folder: Path) -> None:
     axes.set(xlabel="forward CPU time / control", ylabel="error against float64 (o maximum, x mean)")
     axes.legend()
     figure.savefig(folder / "time_error.png", dpi=120)
-    for name, key in (("splats", "n"), ("pixels", "width"), ("overdraw", "intersections")):
+    for name, key in (("splats", "n"), ("pixels", "width"), ("overdraw", "covered_area")):
         chosen = [row for row in rows if row["workload"] == name]
         if not chosen:
             continue
