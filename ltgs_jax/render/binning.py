@@ -123,7 +123,6 @@ def bin_splats(projected: Projected, grid: Grid, capacity: int, active: Int[Arra
     def no_pairs(*_):
         return jnp.zeros(capacity, jnp.int32), jnp.zeros(grid.count + 1, jnp.int32)
 
-    # The branch also keeps XLA from fusing the tables into their gathers, which would compute every entry anew for every
-    # pair.
+    # The branch also keeps XLA from fusing the tables into their gathers, where each entry would be computed per pair.
     splats, edges = jax.lax.cond(total > 0, sort_pairs, no_pairs, order, begins, box_table, shape_table)
     return Bins(splats, edges[:-1], edges[1:] - edges[:-1], overflow)
