@@ -101,12 +101,13 @@ def test_gradients_match_central_differences(draw):
         np.testing.assert_allclose(gradient[lane], differences[lane], rtol=0, atol=1e-6 * size)
 
 
-def test_forward_mode_equals_reverse_mode():
+@pytest.mark.parametrize("draw", [render, render_reference], ids=["render", "reference"])
+def test_forward_mode_equals_reverse_mode(draw):
     splats, camera = make_splats(30), make_camera(24, 20)
-    plan = plan_render(splats, camera)
+    options = {"plan": plan_render(splats, camera)} if draw is render else {}
 
     def image(tangent):
-        return render(splats, _moved(camera, tangent), plan=plan).image
+        return draw(splats, _moved(camera, tangent), **options).image
 
     zero = jnp.zeros(6)
     forward, reverse = jax.jit(jax.jacfwd(image))(zero), jax.jit(jax.jacrev(image))(zero)
