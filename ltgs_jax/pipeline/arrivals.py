@@ -34,19 +34,19 @@ from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_sp
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
 _PARTLY = 0.1  # share of an object's outline that must have changed for it to be looked for at another turn
-_BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
+_BARED = 0.3  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
-_FLAT = 0.25  # height over width under which something on bared ground is the ground itself
+_FLAT = 0.25  # height over width under which something all on bared ground is the ground itself
 
 
 class Arrival(eqx.Module):
-    """Something that came: its volume and outlines, the surface below, windows around it, and whether it may be ground
-    that nobody saw before: much of it was guessed, or something stood there and left."""
+    """Something that came: its volume and outlines, the surface below, windows around it, and the share of it that may
+    be ground that nobody saw before: it was guessed, or something stood there and left."""
 
     instance: Instance
     support: Support
     crop: Crop
-    bared: bool
+    bared: float
 
 
 class NewObject(eqx.Module):
@@ -91,7 +91,7 @@ def place_arrivals(
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
         crop = _crop_around(instance, observations, evidence, config)
-        arrivals.append(Arrival(instance, support, crop, bool(share > _BARED)))
+        arrivals.append(Arrival(instance, support, crop, float(share)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
     accounts, news = [], {}
     tools = {"config": config, "rng": rng}
@@ -363,7 +363,7 @@ def _add_new(
         progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
-    if arrival.bared and (new.firm.sum() < 8 or _is_flat(splats[new.firm], arrival.support)):
+    if _is_ground(splats[new.firm], arrival):
         progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
         return _with_ground(state, splats, doubt), None
     object_splats = splats[new.firm]
@@ -401,11 +401,14 @@ def _part_of(state: State, t: int, piece: Splats) -> int | None:
     return None
 
 
-def _is_flat(splats: Splats, support: Support) -> bool:
-    means, weight = np.asarray(splats.means, np.float64), np.asarray(splats.opacities)
-    firm = means[weight > min(0.3, np.quantile(weight, 0.7))]
-    width = np.linalg.norm(np.ptp(firm @ support.frame()[:2].T, axis=0))
-    return bool(np.median(support.height(firm)) < _FLAT * width)
+def _is_ground(firm: Splats, arrival: Arrival) -> bool:
+    """Whether what came is ground that something had hidden: the more of it lies there, the less flat it must be."""
+    if arrival.bared < _BARED or firm.count < 8:
+        return arrival.bared >= _BARED
+    means, weight = np.asarray(firm.means, np.float64), np.asarray(firm.opacities)
+    means = means[weight > min(0.3, np.quantile(weight, 0.7))]
+    width = np.linalg.norm(np.ptp(means @ arrival.support.frame()[:2].T, axis=0))
+    return bool(np.median(arrival.support.height(means)) < _FLAT * arrival.bared * width)
 
 
 def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:

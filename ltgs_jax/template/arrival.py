@@ -15,9 +15,10 @@ from ltgs_jax.scene import Splats, Template
 
 from .config import TemplateConfig
 from .consistency import surface_evidence
-from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of
+from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of, turned_round
 from .support import Support, Vantage, fit_support, rotation_about
 
+_TURNS = 12  # in place, of what was found
 _AGREE = 0.06  # difference of colours at which two photographs hardly show one surface
 
 
@@ -116,10 +117,11 @@ def thin(splats: Splats, most: int) -> Splats:
 
 
 class Search(eqx.Module):
-    """Promising poses of a template and the mean unlikeness with it at each, in coarse windows; the error `without`
-    it, and the part of that which is to be explained."""
+    """Promising poses of a template on a surface of unit `normal`, and the mean unlikeness with it at each, in coarse
+    windows; the error `without` it, and the part of that which is to be explained."""
 
     template: Splats
+    normal: Float[np.ndarray, "3"]
     poses: SE3
     errors: Float[np.ndarray, " m"]
     without: float
@@ -165,7 +167,7 @@ def search_template(
             light, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, tolerance=0.1 * size, rng=rng
         )
         order = np.argsort(errors, kind="stable")
-        found = Search(light, poses[order], errors[order], without, change)
+        found = Search(light, stands_on.normal, poses[order], errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():
             best = found
         if upright or best.best_gain > config.tau_search:
@@ -175,10 +177,18 @@ def search_template(
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """Refine the best two poses of a search on the pixels, in all six freedoms."""
-    tolerance = 0.1 * size
-    found = refiner.refine(search.template, search.poses[:2], crop, size=size, tolerance=tolerance, steps=12, blurred=3)
-    return place_template(search, found.poses[int(np.argmin(found.errors))], crop, size=size, refiner=refiner)
+    """Refine the best two poses of a search on the pixels, in all six freedoms, then the best two turns in place of
+    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell."""
+    options = {"size": size, "tolerance": 0.1 * size, "blurred": 3}
+    found = refiner.refine(search.template, search.poses[:2], crop, steps=12, **options)
+    best = int(np.argmin(found.errors))
+    turned = turned_round(found.poses[best], search.template, search.normal, _TURNS)[1:]
+    scores = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
+    other = refiner.refine(search.template, turned[np.argsort(scores, kind="stable")[:2]], crop, steps=8, **options)
+    pose = found.poses[best]
+    if other.errors.min() < found.errors[best]:
+        pose = other.poses[int(np.argmin(other.errors))]
+    return place_template(search, pose, crop, size=size, refiner=refiner)
 
 
 def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> Placement:

@@ -237,6 +237,13 @@ def _slid(pose, center, shift, normal, angle):
     return moved
 
 
+def turned_round(pose: SE3, template: Splats, normal: Float[np.ndarray, "3"], count: int) -> SE3:
+    """A pose [] of a template turned by each multiple of a `count`-th of a full turn about `normal`, itself first."""
+    center, matrix = np.asarray(_middle(template).xyz, np.float64), np.asarray(pose.as_matrix(), np.float64)
+    turns = [_slid(matrix, center, np.zeros(3), normal, 2 * np.pi * i / count) for i in range(count)]
+    return SE3.from_matrix(jnp.asarray(np.stack(turns), jnp.float32))
+
+
 class Refinement(eqx.Module):
     """Poses after descent and the mean unlikeness of each."""
 
