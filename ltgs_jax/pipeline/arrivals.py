@@ -33,10 +33,11 @@ from .config import Config
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
-_PARTLY = 0.1  # share of an object's outline that must have changed for it to be looked for at another turn
+_PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
+_BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _BARED = 0.3  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
-_FLAT = 0.25  # height over width under which something all on bared ground is the ground itself
+_FLAT = 0.25  # height over width under which something of which half lies on bared ground is the ground itself
 
 
 class Arrival(eqx.Module):
@@ -188,15 +189,17 @@ def turn_in_place(
 
 
 def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
-    """Templates that seemed to leave, and those of which two photographs or more show a part that changed."""
+    """Templates that seemed to leave, and those on or beside which two photographs or more show that a part changed."""
     scene = scene_at(state, t)
     for k in range(len(state.chronology.templates)):
         if k in gone:
             yield k
         elif bool(np.asarray(state.chronology.visible)[t, k]):
             cover = eye.cover(scene, [k], observations)
-            shares = [(c & m).sum() / max(c.sum(), 1) for c, m in zip(cover, evidence.masks, strict=True)]
-            if sum(share > _PARTLY for share in shares) >= 2:
+            areas = [max(c.sum(), 1) for c in cover]
+            near = [dilate(c, max(1, round(_BESIDE * area**0.5))) for c, area in zip(cover, areas, strict=True)]
+            changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
+            if sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2:
                 yield k
 
 
@@ -408,7 +411,7 @@ def _is_ground(firm: Splats, arrival: Arrival) -> bool:
     means, weight = np.asarray(firm.means, np.float64), np.asarray(firm.opacities)
     means = means[weight > min(0.3, np.quantile(weight, 0.7))]
     width = np.linalg.norm(np.ptp(means @ arrival.support.frame()[:2].T, axis=0))
-    return bool(np.median(arrival.support.height(means)) < _FLAT * arrival.bared * width)
+    return bool(np.median(arrival.support.height(means)) < _FLAT * min(2 * arrival.bared, 1) * width)
 
 
 def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:
