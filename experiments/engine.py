@@ -33,6 +33,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from ltgs_jax.pipeline.programs import free_programs
+
 MACHINE = ("seconds", "fps")
 """Starts of the names of columns that tell of the machine and its load, not of the result."""
 
@@ -143,6 +145,7 @@ def execute(run: Run, out: Path, *, retry: bool = False) -> dict:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         row = {"status": "failed", "reason": f"{type(error).__name__}: {reason}"[:300]}
     write_json(result, row)
+    free_programs()
     return row
 
 

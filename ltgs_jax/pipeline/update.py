@@ -40,6 +40,7 @@ from .hold import only_run
 from .looks import Eye, Observation
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
+from .programs import free_programs
 from .state import Account, State, pack_splats, pack_state, unpack_splats, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
@@ -116,6 +117,7 @@ def update(
         key = digest(key, config.detect, config.match, config.template, config.register)
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
+            free_programs()
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
         chronology = _long_fit(store, digest(key, "fit"), run, state, progress)
