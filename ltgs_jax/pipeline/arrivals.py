@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
+from ltgs_jax.geometry import C0
 from ltgs_jax.match import Instance
 from ltgs_jax.scene import Splats, Template, transform_splats
 from ltgs_jax.template import (
@@ -35,9 +36,11 @@ from .state import Account, State, add_template, extend_background, extend_templ
 
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
-_BARED = 0.3  # share of what came, over which it lies where something that left had hidden the ground
+_BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
-_FLAT = 0.25  # height over width under which something of which half lies on bared ground is the ground itself
+_FLAT = 0.3  # height over width under which something may be the ground itself
+_TINT = 0.05  # difference of chromaticity up to which it is: shadows and bared ground have the colour of what is around
+_SHADED = (0.4, 1.05)  # brightness of a shadow over that of the ground around
 
 
 class Arrival(eqx.Module):
@@ -366,8 +369,12 @@ def _add_new(
         progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
-    if _is_ground(splats[new.firm], arrival):
-        progress.note(f"visit {t}: ground that was hidden before, from {arrival.instance.views} photographs")
+    views = arrival.instance.views
+    if _is_ground(state, splats[new.firm], arrival):
+        if arrival.bared < _BARED:
+            progress.note(f"visit {t}: a shadow in {views} photographs, left out")
+            return state, None
+        progress.note(f"visit {t}: ground that was hidden before, from {views} photographs")
         return _with_ground(state, splats, doubt), None
     object_splats = splats[new.firm]
     low = arrival.support.height(np.asarray(splats.means, np.float64)) < _LOW * template_diameter(object_splats)
@@ -381,7 +388,7 @@ def _add_new(
     errors = np.full(object_splats.count, doubt, state.errors.dtype)
     template = Template(object_splats, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
-    return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, arrival.instance.views)
+    return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
 
 
 def _with_ground(state: State, splats: Splats, doubt: float) -> State:
@@ -404,14 +411,39 @@ def _part_of(state: State, t: int, piece: Splats) -> int | None:
     return None
 
 
-def _is_ground(firm: Splats, arrival: Arrival) -> bool:
-    """Whether what came is ground that something had hidden: the more of it lies there, the less flat it must be."""
-    if arrival.bared < _BARED or firm.count < 8:
-        return arrival.bared >= _BARED
-    means, weight = np.asarray(firm.means, np.float64), np.asarray(firm.opacities)
-    means = means[weight > min(0.3, np.quantile(weight, 0.7))]
+def _is_ground(state: State, firm: Splats, arrival: Arrival) -> bool:
+    """Whether what came is the ground itself, in shadow or seen for the first time: flat, and of the ground's tint. The
+    more of it something had hidden, the more the tint may differ."""
+    if firm.count < 8:
+        return arrival.bared > _BARED
+    means = np.asarray(firm.means, np.float64)
     width = np.linalg.norm(np.ptp(means @ arrival.support.frame()[:2].T, axis=0))
-    return bool(np.median(arrival.support.height(means)) < _FLAT * min(2 * arrival.bared, 1) * width)
+    if np.median(arrival.support.height(means)) > _FLAT * width:
+        return False
+    around = _ground_around(state, means, arrival.support)
+    if around is None:
+        return arrival.bared > _BARED
+    colors = np.clip(np.asarray(firm.sh[:, 0]) * C0 + 0.5, 0, 1)
+    tint = np.median(np.abs(_chromaticity(colors) - _chromaticity(around)).max(axis=-1))
+    shade = np.median(colors.sum(axis=-1)) / max(around.sum(), 0.05)
+    shaded = _SHADED[0] < shade < _SHADED[1]
+    return bool(tint < _TINT * (1 + arrival.bared) and (shaded or arrival.bared > _BARED))
+
+
+def _ground_around(state: State, means: Float[np.ndarray, "n 3"], support: Support) -> Float[np.ndarray, "3"] | None:
+    """Colour of the background's splats on a support around some points, or None where there are few."""
+    background = state.chronology.background
+    ground, size = np.asarray(background.means, np.float64), np.linalg.norm(np.ptp(means, axis=0))
+    near = np.linalg.norm(ground - np.median(means, axis=0), axis=1) < 1.2 * size
+    near &= np.abs(support.height(ground)) < 4 * support.noise + 0.02 * size
+    near &= np.asarray(background.opacities) > 0.3
+    if near.sum() < 8:
+        return None
+    return np.median(np.clip(np.asarray(background.sh[:, 0])[near] * C0 + 0.5, 0, 1), axis=0)
+
+
+def _chromaticity(colors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    return colors / np.maximum(colors.sum(axis=-1, keepdims=True), 0.05)
 
 
 def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:
