@@ -153,14 +153,14 @@ ABLATION = {
     "without pose refinement": (("fit.long.fit_poses", False),),
     "without background refinement": (("fit.long.background_rate", 0.0),),
     "without photographs of the first visit": (("fit.long.replay", 0.0),),
-    "without the long fit": (("fit.long.steps", 0),),
+    "without the long fit": (("fit.long.passes", 0),),
 }
 HYPERPARAMETERS = {
     "detect.sigmas": (3.0, 5.0, 8.0),
     "detect.gamma": (0.5, 0.7, 0.9),
     "match.min_new": (0.15, 0.3, 0.6),
     "template.tau_same": (0.05, 0.11, 0.2),
-    "fit.long.steps": (0, 80, 200),
+    "fit.long.passes": (0, 8, 16),
 }
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from ltgs_jax import io
 from ltgs_jax.geometry import SE3
-from ltgs_jax.scene import Chronology, Splats, Template, compose
+from ltgs_jax.scene import Chronology, Splats, Template, compose, ground_layers
 
 
 def make_splats(rng, n: int, k: int, dtype) -> Splats:
@@ -34,6 +34,7 @@ def make_chronology(*, templates: int = 2, dtype=jnp.float32) -> Chronology:
         exposure=jnp.asarray(rng.normal(size=(2, 3, 2)), dtype),
         visits=("a", "IMG_0001", "ü"),
         photographs=("a/000.png", "IMG_0001/x y.jpg"),
+        since=jnp.asarray([0] * 8 + [1, 1, 2], jnp.int32) if templates else None,
     )
 
 
@@ -54,6 +55,16 @@ def test_round_trip_is_exact(tmp_path, templates):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["chronology.json", "chronology.safetensors"]
     description = json.loads((tmp_path / "chronology.json").read_text())
     assert description["visits"] == ["a", "IMG_0001", "ü"] and len(description["templates"]) == templates
+
+
+def test_ground_shows_from_the_visit_that_brought_it_to_light():
+    chronology = make_chronology(templates=1)
+    shown = [np.isfinite(np.asarray(compose(chronology, t).logit_opacities[:11])) for t in range(3)]
+    assert [int(s.sum()) for s in shown] == [8, 10, 11]
+    layers = ground_layers(chronology)
+    assert {t: splats.count for t, splats in layers.items()} == {0: 8, 1: 2, 2: 1}
+    np.testing.assert_array_equal(layers[1].means, chronology.background.means[8:10])
+    assert ground_layers(make_chronology(templates=0))[0].count == 11
 
 
 def test_float64_stays(tmp_path):

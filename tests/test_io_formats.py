@@ -6,6 +6,7 @@ import json
 import struct
 import zlib  # noqa: F401  before pycolmap, whose own copy would otherwise be taken
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -263,6 +264,18 @@ def test_gltf_plays_the_poses(tmp_path):
     np.testing.assert_array_equal(positions, chronology.templates[0].splats.means)
     scene = trimesh.load(tmp_path / "poses.glb")
     assert sum(len(g.vertices) for g in scene.geometry.values()) == 40 + 5 + 6
+
+
+def test_gltf_shows_ground_from_its_visit_on(tmp_path):
+    chronology = make_chronology()
+    since = np.r_[np.zeros(chronology.background.count - 3, np.int32), [2, 2, 2]].astype(np.int32)
+    late = eqx.tree_at(lambda c: c.since, chronology, since, is_leaf=lambda leaf: leaf is None)
+    io.write_gltf(tmp_path / "ground.glb", late)
+    document, _ = read_glb(tmp_path / "ground.glb")
+    names = [node["name"] for node in document["nodes"]]
+    assert names[:2] == ["background", f"background_from_{chronology.visits[2]}"]
+    assert document["nodes"][1]["scale"] == [0, 0, 0]
+    assert {"node": 1, "path": "scale"} in [channel["target"] for channel in document["animations"][0]["channels"]]
 
 
 def test_gltf_of_a_scene_in_which_nothing_happened(tmp_path):

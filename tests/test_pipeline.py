@@ -20,7 +20,7 @@ from ltgs_jax.render import render
 from ltgs_jax.scene import compose
 
 _TINY = pipeline.PRESETS["tiny"]
-CONFIG = replace(_TINY, fit=replace(_TINY.fit, long=replace(_TINY.fit.long, steps=12)))
+CONFIG = replace(_TINY, fit=replace(_TINY.fit, long=replace(_TINY.fit.long, passes=2)))
 
 
 class Quiet:

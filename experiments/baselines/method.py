@@ -16,9 +16,8 @@ from ltgs_jax.fit import View, VisitView, photometric_loss
 from ltgs_jax.fit.optimizer import Rates, adam
 from ltgs_jax.fit.views import plan_for, scene_extent, size_of
 from ltgs_jax.geometry import Camera
-from ltgs_jax.pipeline.looks import pad_splats
 from ltgs_jax.render import RenderPlan, render
-from ltgs_jax.scene import Splats
+from ltgs_jax.scene import Splats, pad_splats
 
 Model = TypeVar("Model", bound=eqx.Module)
 SceneOf = Callable[[Model, jax.Array, jax.Array, Camera], tuple[Splats, Camera]]
@@ -49,7 +48,7 @@ def run_method(method: Method, config: MethodConfig, folder: Path, cache: Path) 
     problem = load_problem(config.scene, cache)
     initial, _, seconds = initial_scene(config.scene, problem, cache)
     # Empty slots up to one size: the programs of one capture then serve the next.
-    padded = jax.tree.map(jnp.asarray, pad_splats(initial, multiple=config.scene.initial.max_splats))
+    padded = jax.tree.map(jnp.asarray, pad_splats(initial, config.scene.initial.max_splats))
     with Clock() as clock:
         answer = method(problem, padded, config)
     return {**score(problem, answer, folder), **clock.row(), "seconds_initial": seconds["seconds_cpu"]}

@@ -23,7 +23,7 @@ from ltgs_jax.io import load_chronology
 from ltgs_jax.pipeline import PRESETS, update
 from ltgs_jax.scene import compose, drop_hidden
 
-RIGID = (("template.tau_new", 2.0), ("fit.long.steps", 0))
+RIGID = (("template.tau_new", 2.0), ("fit.long.passes", 0))
 """No new object ever explains twice the change; nothing is optimised."""
 
 

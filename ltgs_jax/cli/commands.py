@@ -42,10 +42,10 @@ def _for_small_photographs(config: Any) -> Any:
 
     All steps at full size: a coarse start costs more to compile here than it saves.
     """
-    initial, long = config.fit.initial, config.fit.long
+    initial = config.fit.initial
     steps, splats = min(initial.steps, 500), min(initial.max_splats, 15_000)
     initial = replace(initial, steps=steps, max_splats=splats, coarse_fraction=0.0)
-    return replace(config, fit=replace(config.fit, initial=initial, long=replace(long, steps=min(long.steps, 150))))
+    return replace(config, fit=replace(config.fit, initial=initial))
 
 
 def _make_demo_capture(folder: Path, options: Demo, progress: Reporter) -> None:

@@ -11,25 +11,28 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
 from ltgs_jax.render import RenderPlan, render
-from ltgs_jax.scene import Chronology, Splats, compose
+from ltgs_jax.scene import Chronology, Splats, compose, concatenate_splats, pad_splats, transform_splats
 
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
 from .views import StreamedView, View, plan_for, scene_extent, size_of
+from .windows import Window, window_side, windows_of, within_change
 
 
 @dataclass(frozen=True)
 class LongConfig:
-    """How the chronology is refined (section 3.4 of the LTGS paper)."""
+    """How the chronology is refined (section 3.4 of the LTGS paper), in the parts of photographs that changed."""
 
-    steps: int = 200
-    """Adam steps, one photograph each."""
+    passes: int = 16
+    """Adam steps on each window of a later photograph; 0: nothing is refined."""
     replay: float = 0.4
     """Share of the steps spent on photographs of the first visit, against forgetting."""
+    window: float = 0.275
+    """Side of a window, as a share of the photographs' longer side."""
     dssim: float = 0.2
     """λ, the weight of 1 − SSIM in the loss."""
-    background_rate: float = 0.3
-    """Factor on the rates of the background's splats; templates and what is new have 1."""
+    background_rate: float = 1.0
+    """Factor on the rates of the background's splats that the first visit showed; 0: they stay as they are."""
     translation_rate: float = 1e-3
     """Step of a pose's translation, in units of the object's diameter."""
     rotation_rate: float = 1e-3
@@ -90,131 +93,220 @@ def placements_of(chronology: Chronology) -> Placements:
 class _Variables(eqx.Module):
     """What is optimised: splats, and a tangent per distinct pose."""
 
-    background: Splats
-    templates: tuple[Splats, ...]
+    splats: Splats
     tangents: Float[Array, "p 6"]
 
 
-def _assemble(variables: _Variables, chronology: Chronology, placements: Placements) -> Chronology:
-    """The chronology with the variables in place."""
-    poses = placements.poses @ SE3.exp(variables.tangents)
-    templates = tuple(
-        eqx.tree_at(lambda m: m.splats, template, splats)
-        for template, splats in zip(chronology.templates, variables.templates, strict=True)
-    )
-    return eqx.tree_at(
-        lambda c: (c.background, c.templates, c.world_from_template),
-        chronology,
-        (variables.background, templates, poses[placements.index]),
-    )
+class _Fixed(eqx.Module):
+    """What stays: the ground's other splats; whose the variable ones are (0 the ground's, 1 + k template k's) and the
+    factor on their rates; poses, the diameter of each pose's object, and the scene's extent."""
+
+    ground: Splats
+    owner: Int[Array, " n"]
+    rate: Float[Array, " n"]
+    placements: Placements
+    diameters: Float[Array, " p"]
+    extent: Float[Array, ""]
 
 
-@eqx.filter_jit
-def _step(inputs, variables, state, chronology, placements, movable, config: LongConfig, plan: RenderPlan):
-    """One step on one photograph. `inputs`: camera, image, mask, visit, extent, diameters, progress."""
-    camera, image, mask, visit, extent, diameters, progress = inputs
-    target = image.astype(jnp.float32) / 255
+def _window_splats(splats: Splats, tangents, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
+    """What shows in a window: its variable splats, where they are at that visit, and those of the ground."""
+    poses = fixed.placements.poses @ SE3.exp(tangents)
+    here = poses[fixed.placements.index[visit]]
+    still = SE3.identity((1,), splats.means.dtype)
+    here = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), still, here)
+    owner = fixed.owner.at[rows].get(mode="clip")
+    moved = transform_splats(here, _hide_padding(splats, rows, fixed.owner.shape[0]), owner)
+    around = jax.tree.map(lambda leaf: leaf.at[ground_rows].get(mode="clip"), fixed.ground)
+    return concatenate_splats([moved, _hide_padding(around, ground_rows, fixed.ground.count)])
 
-    def objective(variables):
-        splats = compose(_assemble(variables, chronology, placements), visit)
-        out = render(splats, camera, plan=plan)
-        loss = photometric_loss(out.image, target, mask, dssim=config.dssim)
-        needles = sum(
-            (jnp.mean(jax.nn.relu(jnp.ptp(s.log_scales, axis=-1) - jnp.log(8.0))) for s in variables.templates),
-            start=jnp.asarray(0.0),
-        )
+
+def _hide_padding(splats: Splats, rows, count: int) -> Splats:
+    """Rows that name no splat do not show."""
+    return eqx.tree_at(lambda s: s.logit_opacities, splats, jnp.where(rows < count, splats.logit_opacities, -jnp.inf))
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _step(inputs, variables: _Variables, state, config: LongConfig, plan: RenderPlan):
+    """One step on one window. `inputs`: what is fixed, window, its rows of the variable splats and of the ground's
+    (padded with counts), progress. Only those rows, and their moments, are touched."""
+    fixed, window, rows, ground_rows, progress = inputs
+    target = window.image.astype(jnp.float32) / 255
+
+    def taken(tree):
+        return jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), tree)
+
+    def put(tree, part):
+        return jax.tree.map(lambda leaf, new: leaf.at[rows].set(new, mode="drop"), tree, part)
+
+    owner, rate = taken((fixed.owner, fixed.rate))
+
+    def objective(local: _Variables):
+        splats = _window_splats(local.splats, local.tangents, rows, ground_rows, window.visit, fixed)
+        out = render(splats, window.camera, plan=plan)
+        loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
+        needle = jax.nn.relu(jnp.ptp(local.splats.log_scales, axis=-1) - jnp.log(8.0))
+        mine = (owner > 0) & (rows < fixed.owner.shape[0])
+        needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
         return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
 
-    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(variables)
-    updates, state = adam().update(gradient, state)
-    background = scale_gradients(updates.background, config.rates, extent, progress)
-    background = jax.tree.map(
-        lambda leaf: config.background_rate * leaf * movable.reshape((-1,) + (1,) * (leaf.ndim - 1)), background
-    )
-    templates = tuple(scale_gradients(u, config.rates, extent, progress) for u in updates.templates)
-    # A pose of an object this photograph cannot see has no gradient, and Adam's momentum must not carry it on.
+    local = _Variables(taken(variables.splats), variables.tangents)
+    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(local)
+    before = state._replace(mu=_with_rows(state.mu, taken), nu=_with_rows(state.nu, taken))
+    updates, after = adam().update(gradient, before)
+    moves = scale_gradients(updates.splats, config.rates, fixed.extent, progress)
+    moves = jax.tree.map(lambda leaf: leaf * rate.reshape((-1,) + (1,) * (leaf.ndim - 1)), moves)
+    # A pose of an object that this window does not show has no gradient, and Adam's momentum must not carry it on.
     seen = jnp.any(gradient.tangents != 0, axis=-1)
-    free = ((~placements.fixed) & seen)[:, None] * float(config.fit_poses)
-    rates = jnp.concatenate(
-        [
-            config.translation_rate * jnp.repeat(diameters[:, None], 3, axis=1),
-            jnp.full((diameters.shape[0], 3), config.rotation_rate),
-        ],
-        axis=1,
-    )
-    tangents = -free * rates * (0.1**progress) * updates.tangents
-    variables = eqx.apply_updates(variables, _Variables(background, templates, tangents))
-    return variables, state, loss, overflow
+    free = (seen & ~fixed.placements.fixed & config.fit_poses)[:, None]
+    pace = jnp.where(jnp.arange(6) < 3, config.translation_rate * fixed.diameters[:, None], config.rotation_rate)
+    tangents = variables.tangents - jnp.where(free, pace * 0.1**progress * updates.tangents, 0)
+    variables = _Variables(put(variables.splats, eqx.apply_updates(local.splats, moves)), tangents)
+
+    def merged(old: _Variables, new: _Variables) -> _Variables:
+        return _Variables(put(old.splats, new.splats), jnp.where(seen[:, None], new.tangents, old.tangents))
+
+    return variables, after._replace(mu=merged(state.mu, after.mu), nu=merged(state.nu, after.nu)), loss, overflow
+
+
+def _with_rows(moments: _Variables, taken) -> _Variables:
+    return _Variables(taken(moments.splats), moments.tangents)
 
 
 def fit_chronology(
     chronology: Chronology,
     views: Sequence[VisitView],
     *,
-    movable: Bool[Array, " n"],
     key: Array,
     config: LongConfig = LongConfig(),
     progress: Callable[[int, int, str], None] = lambda i, n, text: None,
 ) -> tuple[Chronology, Float[np.ndarray, " s"]]:
-    """Refine background, templates and poses over photographs of all visits; no splat is added or removed.
+    """Refine templates, poses and the background around them over photographs of all visits; no splat is added or
+    removed, and the cost goes with the pixels that changed.
 
-    `movable` [n]: the background's splats that may change; all others stay bit for bit. Photographs of visit 0 are
+    Windows of the photographs hold what templates show, and ground that a later visit brought to light (`windows_of`);
+    background splats that show hardly outside of it may change, all others stay bit for bit. Windows of visit 0 are
     replayed for the share `config.replay` of the steps. Returns the chronology and the loss of every step; a run whose
     loss is not finite is stopped and the last finite state returned.
 
     Raises ValueError without a photograph of a later visit.
     """
-    later = [i for i, v in enumerate(views) if v.visit > 0]
-    first = [i for i, v in enumerate(views) if v.visit == 0]
-    if not later:
+    if not any(v.visit > 0 for v in views):
         raise ValueError("views: expected photographs of a later visit, got none")
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+    if config.passes == 0:
+        return chronology, np.zeros(0, np.float32)
+    side = window_side([size_of(v.view) for v in views], config.window)
+    background, since, templates = chronology.background, chronology.since, chronology.templates
+    late = np.zeros(background.count, bool) if since is None else np.asarray(since) > 0
+    owner = np.repeat(np.arange(1 + len(templates)), [background.count, *(m.splats.count for m in templates)])
+    came = np.where(owner == 0, np.pad(late, (0, len(owner) - len(late))), True)
+    windows, votes = [], np.zeros((len(owner), 2))
+    for visit in sorted({v.visit for v in views}):
+        splats = jax.tree.map(np.asarray, _composed(chronology, jnp.asarray(visit)))
+        touched = came & (splats.logit_opacities > -np.inf)
+        found, cast = windows_of([v.view for v in views if v.visit == visit], visit, splats, touched, side=side)
+        windows, votes = windows + found, votes + cast
+    may_change = (owner > 0) | within_change(votes)
+    free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
+    every = jax.tree.map(np.array, concatenate_splats([background, *(m.splats for m in templates)]))
     placements = placements_of(chronology)
-    extent = jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32)
-    diameters = jnp.asarray([template_diameter(t.splats) for t in chronology.templates], jnp.float32)
-    diameters = diameters[placements.template] if len(placements.template) else jnp.zeros(0)
-    variables = _Variables(
-        chronology.background,
-        tuple(t.splats for t in chronology.templates),
-        jnp.zeros((placements.poses.xyz.shape[0], 6), jnp.float32),
+    diameters = np.asarray([template_diameter(m.splats) for m in templates], np.float32)
+    fixed = _Fixed(
+        jax.device_put(pad_splats(every[held], 1)),
+        jnp.asarray(owner[free]),
+        jnp.asarray(np.where(came, 1.0, config.background_rate)[free], jnp.float32),
+        placements,
+        jnp.asarray(diameters[np.asarray(placements.template)]),
+        jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32),
     )
+    start = _Variables(jax.device_put(every[free]), jnp.zeros((len(placements.template), 6), jnp.float32))
+    rows = [(_rows_among(w.rows, free), _rows_among(w.rows, held)) for w in windows]
+    fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, config=config, progress=progress)
+    for leaf, new in zip(jax.tree.leaves(every), jax.tree.leaves(fitted.splats), strict=True):
+        leaf[free] = np.asarray(new)
+    ends = np.cumsum([background.count, *(m.splats.count for m in templates)])
+    parts = [every[slice(a, b)] for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+    poses = (placements.poses @ SE3.exp(fitted.tangents))[placements.index]
+    fitted = eqx.tree_at(
+        lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template), chronology, (*parts, poses)
+    )
+    return jax.tree.map(jnp.asarray, fitted), losses
+
+
+def _rows_among(rows: Int[np.ndarray, " m"], chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    """Where in `chosen`, sorted, those of `rows` lie that are in it."""
+    at = np.searchsorted(chosen, rows)
+    return at[np.append(chosen, -1)[at] == rows]
+
+
+def _fit_windows(
+    variables: _Variables, fixed: _Fixed, windows: Sequence[Window], rows, *, key, config: LongConfig, progress
+) -> tuple[_Variables, Float[np.ndarray, " s"]]:
+    """The steps, each on one window drawn at random."""
+    later = [i for i, w in enumerate(windows) if w.visit > 0]
+    first = [i for i, w in enumerate(windows) if w.visit == 0]
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+    replayed = config.replay if first else 0.0
+    steps = round(config.passes * len(later) / max(1 - replayed, 0.1))
+    losses = np.zeros(steps, np.float32)
+    if steps == 0:
+        progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
+        return variables, losses
+    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first")
+    counts = fixed.owner.shape[0], fixed.ground.count
+    rows = [
+        tuple(_padded(part, most, count) for part, most, count in zip(pair, _most(rows), counts, strict=True))
+        for pair in rows
+    ]
+    # A window's visit is traced, so that one program serves all.
+    windows = [eqx.tree_at(lambda w: (w.visit, w.rows), w, (jnp.asarray(w.visit), None)) for w in windows]
+
+    def plan(variables: _Variables) -> RenderPlan:
+        return plan_for(
+            [(_shown(variables, *pair, w.visit, fixed), w.camera) for w, pair in zip(windows, rows, strict=True)],
+            slack=1.4,
+        )
+
     state = adam().init(variables)
-    plans: dict[tuple[int, int], RenderPlan] = {}
-    losses = np.zeros(config.steps, np.float32)
     queues: dict[bool, list[int]] = {True: [], False: []}
-    finite = variables
-    for step in range(config.steps):
-        replay = bool(first) and rng.random() < config.replay
+    held = plan(variables)
+    finite = kept = jax.tree.map(np.array, variables)
+    for step in range(steps):
+        if step % 100 == 0:
+            finite, kept = kept, jax.tree.map(np.array, variables)
+        replay = rng.random() < replayed
         queue = queues[replay]
         if not queue:
             queue.extend(rng.permutation(first if replay else later).tolist())
-        view = views[queue.pop()]
-        size = size_of(view.view)
-        if size not in plans:
-            plans[size] = _plan(chronology, views, size)
-        inputs = (
-            view.view.camera,
-            view.view.image,
-            view.view.mask,
-            jnp.asarray(view.visit),
-            extent,
-            diameters,
-            jnp.asarray(step / config.steps, jnp.float32),
-        )
-        before = variables
-        variables, state, loss, overflow = _step(
-            inputs, before, state, chronology, placements, movable, config, plans[size]
-        )
+        i = queue.pop()
+        inputs = (fixed, windows[i], *rows[i], jnp.asarray(step / steps, jnp.float32))
+        variables, state, loss, overflow = _step(inputs, variables, state, config, held)
         losses[step] = loss
         if not np.isfinite(losses[step]):
-            progress(step, config.steps, "the loss is not finite: stopped at the last good state")
-            return _assemble(finite, chronology, placements), losses[:step]
-        finite = before
+            progress(step, steps, "the loss is not finite: stopped at the last good state")
+            return finite, losses[:step]
         if int(overflow) > 0:
-            plans[size] = _plan(_assemble(variables, chronology, placements), views, size)
-        if step % 50 == 0 or step == config.steps - 1:
-            progress(step + 1, config.steps, f"loss {losses[max(0, step - 30) : step + 1].mean():.4f}")
-    return _assemble(variables, chronology, placements), losses
+            held = plan(variables)
+        if step % 100 == 0 or step == steps - 1:
+            progress(step + 1, steps, f"loss {losses[max(0, step - 100) : step + 1].mean():.4f}")
+    return variables, losses
+
+
+@eqx.filter_jit
+def _shown(variables: _Variables, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
+    own = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), variables.splats)
+    return _window_splats(own, variables.tangents, rows, ground_rows, visit, fixed)
+
+
+def _most(rows) -> tuple[int, int]:
+    """The most rows of either kind in any window."""
+    return tuple(max(len(pair[kind]) for pair in rows) for kind in (0, 1))
+
+
+def _padded(rows: Int[np.ndarray, " m"], most: int, count: int) -> Int[Array, " n"]:
+    """Rows up to a multiple of 256, with `count`, which names none."""
+    length = max(256, -(-most // 256) * 256)
+    return jnp.asarray(np.pad(rows, (0, length - len(rows)), constant_values=count), jnp.int32)
 
 
 _SHOWN = -2.2  # logit of the opacity from which on a splat counts for the size, 0.1
@@ -226,13 +318,6 @@ def template_diameter(splats: Splats) -> float:
     means = np.asarray(splats.means)
     low, high = np.quantile(means[shown] if shown.any() else means, [0.01, 0.99], axis=0)
     return float(np.linalg.norm(high - low))
-
-
-def _plan(chronology: Chronology, views: Sequence[VisitView], size: tuple[int, int]) -> RenderPlan:
-    """A plan with room for every photograph of one size."""
-    chosen = [v for v in views if size_of(v.view) == size]
-    scenes = {t: _composed(chronology, jnp.asarray(t)) for t in {v.visit for v in chosen}}
-    return plan_for([(scenes[v.visit], v.view.camera) for v in chosen], slack=1.4)
 
 
 _composed = eqx.filter_jit(compose)

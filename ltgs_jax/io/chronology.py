@@ -31,6 +31,8 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
         "visible": chronology.visible,
         "exposure": chronology.exposure,
     }
+    if chronology.since is not None:
+        arrays["background.since"] = chronology.since
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
@@ -64,12 +66,13 @@ def load_chronology(folder: str | Path) -> Chronology:
     rows = description["templates"]
     t, k, p = len(visits), len(rows), len(photographs)
     take = _Taker(arrays, path)
+    n = description["background_splats"]
     templates = tuple(
         Template(take.splats(f"templates.{i}", row["splats"]), row["identity"], row["source_visit"])
         for i, row in enumerate(rows)
     )
     return Chronology(
-        background=take.splats("background", description["background_splats"]),
+        background=take.splats("background", n),
         templates=templates,
         world_from_template=SE3(
             take("world_from_template.quat", (t, k, 4)),
@@ -79,6 +82,7 @@ def load_chronology(folder: str | Path) -> Chronology:
         exposure=take("exposure", (p, 3, 2)),
         visits=visits,
         photographs=photographs,
+        since=take("background.since", (n,), dtypes=("int32",)) if "background.since" in arrays else None,
     )
 
 

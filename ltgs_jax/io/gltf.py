@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ltgs_jax.scene import Chronology, Splats
+from ltgs_jax.scene import Chronology, Splats, ground_layers
 
 from .files import write_bytes
 from .packing import color_of_sh
@@ -41,7 +41,7 @@ class _Buffer:
 def write_gltf(path: str | Path, chronology: Chronology, *, most_background: int = 50_000) -> None:
     """Write a .glb: a node per template with its pose keyed once a second per visit, its splats' centres as points.
 
-    Poses move linearly between visits; a template that is not visible is scaled to 0, at once. The capture's frame is
+    Poses move linearly between visits; what is not visible is scaled to 0, at once. The capture's frame is
     kept (glTF viewers take y as up). Of the background at most `most_background` points, evenly spread, are written.
     Raises InputError when the file cannot be written.
     """
@@ -49,27 +49,34 @@ def write_gltf(path: str | Path, chronology: Chronology, *, most_background: int
     nodes: list[dict] = []
     meshes: list[dict] = []
     step = max(1, -(-chronology.background.count // most_background))
-    _add_node(nodes, meshes, buffer, "background", chronology.background[::step])
     channels: list[dict] = []
     samplers: list[dict] = []
+
+    def animate(node: int, target: str, values: np.ndarray, interpolation: str) -> None:
+        samplers.append({"input": clock, "output": buffer.add(values, is_vertex=False), "interpolation": interpolation})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
+        nodes[node][target] = np.asarray(values[0], np.float32).tolist()
+
+    def scales(shown: np.ndarray) -> np.ndarray:
+        return np.repeat(shown[:, None].astype(float), 3, axis=1)
+
     times = np.arange(len(chronology.visits)) * _SECONDS_PER_VISIT
     quats = np.asarray(chronology.world_from_template.quat, np.float64)
     xyz = np.asarray(chronology.world_from_template.xyz, np.float64)
     visible = np.asarray(chronology.visible)
-    if chronology.templates:
+    ground = ground_layers(chronology)
+    if chronology.templates or len(ground) > 1:
         clock = buffer.add(times, is_vertex=False)
-        for k, template in enumerate(chronology.templates):
-            node = _add_node(nodes, meshes, buffer, _name(chronology, k), template.splats)
-            keyed = (
-                ("translation", xyz[:, k], "LINEAR"),
-                ("rotation", _continuous(quats[:, k])[:, [1, 2, 3, 0]], "LINEAR"),
-                ("scale", np.repeat(visible[:, k, None].astype(float), 3, axis=1), "STEP"),
-            )
-            for target, values, interpolation in keyed:
-                output = buffer.add(values, is_vertex=False)
-                samplers.append({"input": clock, "output": output, "interpolation": interpolation})
-                channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": target}})
-                nodes[node][target] = np.asarray(values[0], np.float32).tolist()
+    for since, splats in ground.items():
+        name = "background" if since == 0 else f"background_from_{chronology.visits[since]}"
+        node = _add_node(nodes, meshes, buffer, name, splats[::step])
+        if since > 0:
+            animate(node, "scale", scales(np.arange(len(times)) >= since), "STEP")
+    for k, template in enumerate(chronology.templates):
+        node = _add_node(nodes, meshes, buffer, _name(chronology, k), template.splats)
+        animate(node, "translation", xyz[:, k], "LINEAR")
+        animate(node, "rotation", _continuous(quats[:, k])[:, [1, 2, 3, 0]], "LINEAR")
+        animate(node, "scale", scales(visible[:, k]), "STEP")
     document = {
         "asset": {"version": "2.0", "generator": "ltgs-jax"},
         "scene": 0,

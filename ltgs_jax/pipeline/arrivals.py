@@ -12,9 +12,8 @@ from scipy.spatial import cKDTree
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
-from ltgs_jax.geometry import C0
 from ltgs_jax.match import Instance
-from ltgs_jax.scene import Splats, Template, transform_splats
+from ltgs_jax.scene import Splats, Template, pad_splats, transform_splats
 from ltgs_jax.template import (
     Crop,
     Placement,
@@ -31,16 +30,14 @@ from ltgs_jax.template import (
 )
 
 from .config import Config
-from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, pad_splats, vantage_of
+from .ground import ground_shade
+from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
-_FLAT = 0.3  # height over width under which something may be the ground itself
-_TINT = 0.05  # difference of chromaticity up to which it is: shadows and bared ground have the colour of what is around
-_SHADED = (0.4, 1.05)  # brightness of a shadow over that of the ground around
 
 
 class Arrival(eqx.Module):
@@ -370,15 +367,17 @@ def _add_new(
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
     views = arrival.instance.views
-    if _is_ground(state, splats[new.firm], arrival):
-        if arrival.bared < _BARED:
+    bared = arrival.bared > _BARED
+    ground, shade = ground_shade(splats[new.firm], arrival.support, state.chronology.background, bared=arrival.bared)
+    if ground or (ground is None and bared):
+        if shade < 1 and not bared:
             progress.note(f"visit {t}: a shadow in {views} photographs, left out")
             return state, None
         progress.note(f"visit {t}: ground that was hidden before, from {views} photographs")
-        return _with_ground(state, splats, doubt), None
+        return _with_ground(state, t, splats, doubt), None
     object_splats = splats[new.firm]
     low = arrival.support.height(np.asarray(splats.means, np.float64)) < _LOW * template_diameter(object_splats)
-    state = _with_ground(state, splats[~new.firm & low], doubt)
+    state = _with_ground(state, t, splats[~new.firm & low], doubt)
     whole = _part_of(state, t, object_splats)
     if whole is not None:
         progress.note(f"visit {t}: more of object {state.chronology.templates[whole].identity}, not seen before")
@@ -391,8 +390,8 @@ def _add_new(
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
 
 
-def _with_ground(state: State, splats: Splats, doubt: float) -> State:
-    return extend_background(state, splats, np.full(splats.count, doubt), np.zeros(splats.count, bool))
+def _with_ground(state: State, t: int, splats: Splats, doubt: float) -> State:
+    return extend_background(state, splats, np.full(splats.count, doubt), np.zeros(splats.count, bool), t)
 
 
 def _part_of(state: State, t: int, piece: Splats) -> int | None:
@@ -411,46 +410,11 @@ def _part_of(state: State, t: int, piece: Splats) -> int | None:
     return None
 
 
-def _is_ground(state: State, firm: Splats, arrival: Arrival) -> bool:
-    """Whether what came is the ground itself, in shadow or seen for the first time: flat, and of the ground's tint. The
-    more of it something had hidden, the more the tint may differ."""
-    if firm.count < 8:
-        return arrival.bared > _BARED
-    means = np.asarray(firm.means, np.float64)
-    width = np.linalg.norm(np.ptp(means @ arrival.support.frame()[:2].T, axis=0))
-    if np.median(arrival.support.height(means)) > _FLAT * width:
-        return False
-    around = _ground_around(state, means, arrival.support)
-    if around is None:
-        return arrival.bared > _BARED
-    colors = np.clip(np.asarray(firm.sh[:, 0]) * C0 + 0.5, 0, 1)
-    tint = np.median(np.abs(_chromaticity(colors) - _chromaticity(around)).max(axis=-1))
-    shade = np.median(colors.sum(axis=-1)) / max(around.sum(), 0.05)
-    shaded = _SHADED[0] < shade < _SHADED[1]
-    return bool(tint < _TINT * (1 + arrival.bared) and (shaded or arrival.bared > _BARED))
-
-
-def _ground_around(state: State, means: Float[np.ndarray, "n 3"], support: Support) -> Float[np.ndarray, "3"] | None:
-    """Colour of the background's splats on a support around some points, or None where there are few."""
-    background = state.chronology.background
-    ground, size = np.asarray(background.means, np.float64), np.linalg.norm(np.ptp(means, axis=0))
-    near = np.linalg.norm(ground - np.median(means, axis=0), axis=1) < 1.2 * size
-    near &= np.abs(support.height(ground)) < 4 * support.noise + 0.02 * size
-    near &= np.asarray(background.opacities) > 0.3
-    if near.sum() < 8:
-        return None
-    return np.median(np.clip(np.asarray(background.sh[:, 0])[near] * C0 + 0.5, 0, 1), axis=0)
-
-
-def _chromaticity(colors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    return colors / np.maximum(colors.sum(axis=-1, keepdims=True), 0.05)
-
-
 def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:
     """A new object after a short fit in its windows, what is left unlike the photographs, and the share of the change
     that it explains; splats that the photographs do not support fade and are dropped."""
     size = template_diameter(template.splats)
-    padded = pad_splats(template.splats, multiple=config.template.new_splats)
+    padded = pad_splats(template.splats, config.template.new_splats)
     windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
     splats, _, images = fit_local(padded, windows, size=size, steps=config.template.new_steps)
     error, gain = explained(images, crop)

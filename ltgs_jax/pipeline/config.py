@@ -54,13 +54,13 @@ PRESETS: dict[str, Config] = {
         io=IoConfig(max_side=1600),
         fit=FitConfig(
             initial=InitialConfig(steps=7000, max_splats=200_000, sh_degree=3),
-            long=LongConfig(steps=5000),
+            long=LongConfig(passes=60),
         ),
     ),
     "tiny": replace(
         _FAST,
         io=IoConfig(max_side=160),
-        fit=FitConfig(initial=InitialConfig(steps=250, max_splats=6000, sh_degree=0), long=LongConfig(steps=80)),
+        fit=FitConfig(initial=InitialConfig(steps=250, max_splats=6000, sh_degree=0), long=LongConfig(passes=8)),
     ),
 }
 

@@ -10,6 +10,7 @@ from ltgs_jax.scene import Splats, Template, concatenate_splats
 from ltgs_jax.template import Removal, color_from_photographs, fill_under, find_removed, gone_evidence
 
 from .config import Config
+from .ground import ground_shade
 from .looks import Evidence, Eye, Observation, on_host, projection_of, vantage_of
 from .state import State, add_template, cut_background, extend_background, extend_template, next_identity, set_from
 
@@ -66,6 +67,12 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observatio
     for removal in removals:
         piece = background[removal.members]
         k = _torn_from(state, piece, gone, t)
+        if k is None and removal.support is not None:
+            others = background[~(removal.members | taken)]
+            if ground_shade(piece, removal.support, others)[0]:
+                k = _torn_from(state, piece, range(len(state.chronology.templates)), t)
+                if k is None:
+                    continue
         if k is None:
             template = Template(piece, next_identity(state), 0)
             state = add_template(state, template, errors[removal.members], removal.support, 0)
@@ -89,14 +96,15 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observatio
         )
         # Its colours are guesses: only a strong difference there says that something came.
         doubt = np.where(seen_there, 0.5, 1.0) * config.detect.guessed
-        state = extend_background(state, on_host(ground), doubt, np.ones(ground.count, bool))
+        state = extend_background(state, on_host(ground), doubt, np.ones(ground.count, bool), t)
     return state, gone
 
 
-def _torn_from(state: State, piece: Splats, gone, t: int) -> int | None:
-    """The template, cut out at this visit, that a piece in or beside it, and no larger, belongs to."""
+def _torn_from(state: State, piece: Splats, among, t: int) -> int | None:
+    """The template, of those `among` that came with the first visit, that a piece in or beside it, and no larger,
+    belongs to."""
     means = np.asarray(piece.means)
-    for k in gone:
+    for k in among:
         template = state.chronology.templates[k]
         if template.source_visit != 0 or bool(np.asarray(state.chronology.visible)[t:, k].any()):
             continue

@@ -13,7 +13,7 @@ from ltgs_jax.features import FrontEnd
 from ltgs_jax.geometry import Camera
 from ltgs_jax.match import Cone
 from ltgs_jax.render import RenderPlan, plan_render, render, splat_votes
-from ltgs_jax.scene import Splats
+from ltgs_jax.scene import Splats, pad_splats
 from ltgs_jax.template import Refiner, Vantage
 
 from .config import Config
@@ -42,15 +42,6 @@ class Look(eqx.Module):
 def on_host(splats: Splats) -> Splats:
     """The same splats as NumPy arrays: cutting and joining them then compiles nothing."""
     return jax.tree.map(np.asarray, splats)
-
-
-def pad_splats(splats: Splats, *, multiple: int = _BUCKET) -> Splats:
-    """Invisible splats at the end, up to a multiple."""
-    missing = -splats.count % multiple
-    host = on_host(splats)
-    padded = jax.tree.map(lambda leaf: np.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), host)
-    padded.logit_opacities[splats.count :] = -np.inf
-    return padded
 
 
 @eqx.filter_jit
@@ -92,7 +83,7 @@ class Eye:
 
     def look(self, splats: Splats, camera: Camera, errors: Float[np.ndarray, " n"]) -> Look:
         """Image, alpha, depth and expected dissimilarity; where little is, nothing is expected to agree."""
-        padded = pad_splats(splats)
+        padded = pad_splats(splats, _BUCKET)
         plan = self._plan(padded, camera)
         out = _render(padded, camera, plan)
         values = np.pad(np.asarray(errors, np.float32), (0, padded.count - splats.count))[:, None]
@@ -105,12 +96,12 @@ class Eye:
 
     def image(self, splats: Splats, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """The image alone, in 0…1."""
-        padded = pad_splats(splats)
+        padded = pad_splats(splats, _BUCKET)
         return np.clip(np.asarray(_render(padded, camera, self._plan(padded, camera)).image), 0, 1)
 
     def paint(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
         """Any values of the splats, composited as colours are."""
-        padded = pad_splats(splats)
+        padded = pad_splats(splats, _BUCKET)
         values = np.pad(np.asarray(values, np.float32), ((0, padded.count - splats.count), (0, 0)))
         return np.asarray(_render_values(padded, camera, values, self._plan(padded, camera))[0])
 
@@ -124,7 +115,7 @@ class Eye:
 
     def votes(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "n m"]:
         """Σ αT·value per splat."""
-        padded = pad_splats(splats)
+        padded = pad_splats(splats, _BUCKET)
         votes = _votes(padded, camera, jnp.asarray(values, jnp.float32), self._plan(padded, camera))
         return np.asarray(votes)[: splats.count]
 

@@ -30,7 +30,9 @@ class State(eqx.Module):
     @classmethod
     def of_initial(cls, splats: Splats, errors: Float[np.ndarray, " n"], visits: tuple[str, ...]) -> "State":
         """The first visit alone."""
-        return cls(Chronology.of_initial(splats, visits), errors, np.zeros(splats.count, bool), (), ())
+        chronology = Chronology.of_initial(splats, visits)
+        chronology = eqx.tree_at(lambda c: c.since, chronology, np.zeros(splats.count, np.int32), is_leaf=_is_none)
+        return cls(chronology, errors, np.zeros(splats.count, bool), (), ())
 
 
 class Account(eqx.Module):
@@ -132,7 +134,9 @@ def drop_template(state: State, k: int) -> State:
 
 def _with_templates(state: State, templates, poses: SE3, visible, errors, supports) -> State:
     old = state.chronology
-    chronology = Chronology(old.background, templates, poses, visible, old.exposure, old.visits, old.photographs)
+    chronology = Chronology(
+        old.background, templates, poses, visible, old.exposure, old.visits, old.photographs, old.since
+    )
     return State(chronology, state.errors, state.guessed, errors, supports)
 
 
@@ -146,13 +150,15 @@ def extend_template(state: State, k: int, splats: Splats, errors: np.ndarray) ->
     )
 
 
-def extend_background(state: State, splats: Splats, errors: np.ndarray, guessed: np.ndarray) -> State:
-    """More splats behind everything, at every visit."""
+def extend_background(state: State, splats: Splats, errors: np.ndarray, guessed: np.ndarray, since: int) -> State:
+    """More splats behind everything, from a visit on."""
+    chronology = state.chronology
     return eqx.tree_at(
-        lambda s: (s.chronology.background, s.errors, s.guessed),
+        _of_background,
         state,
         (
-            on_host(concatenate_splats([state.chronology.background, splats])),
+            on_host(concatenate_splats([chronology.background, splats])),
+            np.concatenate([chronology.since, np.full(splats.count, since, np.int32)]),
             np.concatenate([state.errors, errors.astype(state.errors.dtype)]),
             np.concatenate([state.guessed, guessed]),
         ),
@@ -161,11 +167,16 @@ def extend_background(state: State, splats: Splats, errors: np.ndarray, guessed:
 
 def cut_background(state: State, taken: Bool[np.ndarray, " n"]) -> State:
     """The background without some of its splats."""
-    return eqx.tree_at(
-        lambda s: (s.chronology.background, s.errors, s.guessed),
-        state,
-        (state.chronology.background[~taken], state.errors[~taken], state.guessed[~taken]),
-    )
+    return eqx.tree_at(_of_background, state, tuple(leaf[~taken] for leaf in _of_background(state)))
+
+
+def _of_background(state: State) -> tuple:
+    """What has a row for each of the background's splats."""
+    return state.chronology.background, state.chronology.since, state.errors, state.guessed
+
+
+def _is_none(leaf) -> bool:
+    return leaf is None
 
 
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
@@ -188,6 +199,7 @@ def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
         **pack_splats("background.", chronology.background),
         "errors": state.errors,
         "guessed": state.guessed,
+        "since": np.asarray(state.chronology.since),
         "quat": np.asarray(chronology.world_from_template.quat),
         "xyz": np.asarray(chronology.world_from_template.xyz),
         "visible": np.asarray(chronology.visible),
@@ -210,7 +222,7 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
         packed = arrays.get(f"template{k}.support")
         supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
     start = State.of_initial(unpack_splats("background.", arrays), arrays["errors"], visits)
-    start = eqx.tree_at(lambda s: s.guessed, start, arrays["guessed"])
+    start = eqx.tree_at(lambda s: (s.guessed, s.chronology.since), start, (arrays["guessed"], arrays["since"]))
     poses = SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"]))
     return _with_templates(
         start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)

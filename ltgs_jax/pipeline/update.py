@@ -41,7 +41,7 @@ from .looks import Eye, Observation
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
-from .state import Account, State, pack_splats, pack_state, unpack_splats, unpack_state
+from .state import Account, State, pack_splats, pack_state, scene_at, unpack_splats, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
 
@@ -120,7 +120,7 @@ def update(
             free_programs()
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
-        chronology = _long_fit(store, digest(key, "fit"), run, state, progress)
+        chronology = _long_fit(store, digest(key, "fit"), run, state, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
@@ -277,7 +277,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
     return unpack_state(arrays, notes, run.capture.visits), [Account(**a) for a in notes["accounts"]]
 
 
-def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chronology:
+def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress) -> Chronology:
     """Everything together; skipped, and said so, when nothing changed."""
     config = run.config
 
@@ -290,15 +290,13 @@ def _long_fit(store: Store, key: str, run: Run, state: State, progress) -> Chron
             return arrays, {**notes, "counts": {"steps": 0}}
         views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
         for _, view, t in later:
-            rendered = Eye().image(state.chronology.background, view.camera)
+            rendered = eye.image(scene_at(state, t)[0], view.camera)
             tone = fit_tone(view.image.astype(np.float32) / 255, rendered, view.mask)
             image = np.rint(255 * tone(view.image.astype(np.float32) / 255)).astype(np.uint8)
             views.append(VisitView(View(view.camera, image, view.mask), t))
-        movable = jnp.ones(state.chronology.background.count, bool)
         chronology, losses = fit_chronology(
             state.chronology,
             views,
-            movable=movable,
             key=jax.random.key(run.seed + 1),
             config=config.fit.long,
             progress=progress.step,

@@ -124,7 +124,7 @@ def _put_back(
             final[k] = Account(k, "removed", 1 - left / max(stayed, 1e-9), left, len(observations))
     for k in reversed(restored):
         template, errors = state.chronology.templates[k], state.template_errors[k]
-        state = extend_background(drop_template(state, k), template.splats, errors, np.zeros(len(errors), bool))
+        state = extend_background(drop_template(state, k), template.splats, errors, np.zeros(len(errors), bool), 0)
         final = {
             a.template - (a.template > k): Account(a.template - (a.template > k), a.kind, a.gain, a.residual, a.views)
             for a in final.values()

@@ -1,12 +1,14 @@
 """Each template rendered alone, from a few sides."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from ltgs_jax.geometry import SE3, Camera, quat_from_rotmat, stack_cameras
 from ltgs_jax.render import RenderPlan, plan_render, render
-from ltgs_jax.scene import Chronology, Splats
+from ltgs_jax.scene import Chronology, Splats, pad_splats
 
 _SIDE = 144  # pixels
 _AZIMUTHS = np.radians([20, 110, 200, 290])
@@ -54,20 +56,16 @@ def _power_of_two(least: int) -> int:
 
 def _normalized(splats: Splats, count: int) -> Splats:
     """The same around the origin, most of it within a radius of 1; then splats of no opacity up to `count`."""
-    missing = count - splats.count
     points = np.asarray(splats.means, np.float64)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     distances = np.linalg.norm(points - middle, axis=1)
     radius = max(float(np.quantile(distances, 0.98)) if len(points) else 1.0, 1e-6)
-    quats = np.pad(splats.quats, ((0, missing), (0, 0)))
-    quats[splats.count :, 0] = 1
-    return Splats(
-        jnp.asarray(np.pad((points - middle) / radius, ((0, missing), (0, 0))), splats.means.dtype),
-        jnp.asarray(quats),
-        jnp.asarray(np.pad(splats.log_scales, ((0, missing), (0, 0))) - np.log(radius), splats.log_scales.dtype),
-        jnp.asarray(np.pad(splats.logit_opacities, (0, missing), constant_values=-np.inf)),
-        jnp.asarray(np.pad(splats.sh, ((0, missing), (0, 0), (0, 0)))),
+    centred = eqx.tree_at(
+        lambda s: (s.means, s.log_scales),
+        splats,
+        ((points - middle) / radius, np.asarray(splats.log_scales) - np.log(radius)),
     )
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, splats.means.dtype), pad_splats(centred, count))
 
 
 def _ring(up: Float[np.ndarray, "3"]) -> Camera:

@@ -4,6 +4,8 @@ from .chronology import Chronology as Chronology
 from .chronology import Template as Template
 from .chronology import compose as compose
 from .chronology import drop_hidden as drop_hidden
+from .chronology import ground_layers as ground_layers
 from .splats import Splats as Splats
 from .splats import concatenate_splats as concatenate_splats
+from .splats import pad_splats as pad_splats
 from .splats import transform_splats as transform_splats

@@ -27,7 +27,8 @@ class Chronology(eqx.Module):
 
     `world_from_template[t, k]` is the paper's P₀→ₜ, `visible[t, k]` its temporal opacity filter M_{t,o}; `exposure`
     [p 3 2] is gain and offset per channel of each of the p photographs in `photographs` that has its own (none when
-    the light did not change).
+    the light did not change); `since` [n] the visit from which on each of the background's splats shows, ground that a
+    later visit brought to light (None: all from the first).
     """
 
     background: Splats
@@ -37,6 +38,7 @@ class Chronology(eqx.Module):
     exposure: Float[Array, "p 3 2"]
     visits: tuple[str, ...] = eqx.field(static=True)
     photographs: tuple[str, ...] = eqx.field(static=True, default=())
+    since: Int[Array, " n"] | None = None
 
     @staticmethod
     def of_initial(background: Splats, visits: tuple[str, ...]) -> "Chronology":
@@ -52,25 +54,37 @@ class Chronology(eqx.Module):
         )
 
 
+def ground_layers(chronology: Chronology) -> dict[int, Splats]:
+    """The background's splats by the visit from which on they show, the first visit's included; outside jit only."""
+    if chronology.since is None:
+        return {0: chronology.background}
+    since = np.asarray(chronology.since)
+    return {int(t): chronology.background[since == t] for t in np.unique(np.append(since, 0))}
+
+
 def compose(chronology: Chronology, t: int | Int[Array, ""]) -> Splats:
     """The scene at visit `t`: background, then every template moved to its pose, hidden where it is not visible.
 
-    Equation 1 of the LTGS paper and its opacity filter. Hidden templates keep their place in the arrays with opacity 0,
-    so that the shapes do not depend on `t`, which may be traced; `drop_hidden` leaves them out.
+    Equation 1 of the LTGS paper and its opacity filter. What is hidden keeps its place in the arrays with opacity 0, so
+    that the shapes do not depend on `t`, which may be traced; `drop_hidden` leaves it out.
 
     Raises ValueError when `t` is not a visit.
     """
     visits = chronology.visible.shape[0]
     if isinstance(t, int) and not 0 <= t < visits:
         raise ValueError(f"t: expected a visit from 0 to {visits - 1}, got {t}")
+    background = chronology.background
+    if chronology.since is not None:
+        logits = jnp.where(chronology.since <= t, background.logit_opacities, -jnp.inf)
+        background = eqx.tree_at(lambda s: s.logit_opacities, background, logits)
     if not chronology.templates:
-        return chronology.background
+        return background
     # All templates at once: what there is to compile does not grow with their number.
     splats = concatenate_splats([template.splats for template in chronology.templates])
     owner = np.repeat(np.arange(len(chronology.templates)), [m.splats.count for m in chronology.templates])
     moved = transform_splats(chronology.world_from_template[t], splats, owner)
     logits = jnp.where(chronology.visible[t][owner], moved.logit_opacities, -jnp.inf)
-    return concatenate_splats([chronology.background, eqx.tree_at(lambda s: s.logit_opacities, moved, logits)])
+    return concatenate_splats([background, eqx.tree_at(lambda s: s.logit_opacities, moved, logits)])
 
 
 def drop_hidden(splats: Splats) -> Splats:

@@ -62,6 +62,14 @@ def concatenate_splats(parts: list[Splats]) -> Splats:
     return jax.tree.map(lambda *leaves: xp.concatenate(leaves), *padded)
 
 
+def pad_splats(splats: Splats, multiple: int) -> Splats:
+    """The splats on the host, with invisible ones after them up to a multiple, not 0: few shapes, few programs."""
+    missing = -max(splats.count, 1) % multiple + max(splats.count, 1) - splats.count
+    padded = jax.tree.map(lambda leaf: np.pad(np.asarray(leaf), ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
+    padded.logit_opacities[splats.count :] = -np.inf
+    return padded
+
+
 def transform_splats(b_from_a: SE3, splats: Splats, owner: Int[Array, " n"] | None = None) -> Splats:
     """Move splats rigidly: means, orientations and spherical harmonics (equation 1 of the LTGS paper).
 

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from ltgs_jax.geometry import C0, SE3, quat_from_rotmat
 from ltgs_jax.match import Cone, Instance, carve, grid_around
-from ltgs_jax.scene import Splats, Template
+from ltgs_jax.scene import Splats, Template, pad_splats
 
 from .config import TemplateConfig
 from .consistency import surface_evidence
@@ -106,10 +106,7 @@ def thin(splats: Splats, most: int) -> Splats:
     """Exactly `most` splats: those of largest opacity × area, made to cover as much as all did, or padded with
     invisible ones, so that every template runs in one compiled program."""
     if splats.count <= most:
-        missing = most - splats.count
-        padded = jax.tree.map(lambda leaf: np.pad(leaf, ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
-        padded.logit_opacities[splats.count :] = -np.inf
-        return jax.device_put(padded)
+        return jax.device_put(pad_splats(splats, most))
     area = np.exp(np.sum(np.sort(np.asarray(splats.log_scales), axis=1)[:, 1:], axis=1)) * np.asarray(splats.opacities)
     keep = np.sort(np.argsort(-area, kind="stable")[:most])
     grow = 0.5 * np.log(area.sum() / area[keep].sum())

@@ -9,7 +9,7 @@ import numpy as np
 
 from ltgs_jax.io import load_chronology
 from ltgs_jax.report import Run, Shot, color_of, difference, fitted, happenings, read_run, read_shown, up_direction
-from ltgs_jax.scene import Chronology
+from ltgs_jax.scene import Chronology, ground_layers
 
 from .layers import Layer, Viewpoint, extent_of, layer_of, place_at, viewpoint_of
 
@@ -101,11 +101,11 @@ class Viewer:
 
     def _build_scene(self) -> None:
         scene, chronology = self.server.scene, self._chronology
-        background = layer_of(chronology.background)
-        middle, reach = extent_of(background)
+        ground = {t: layer_of(splats) for t, splats in ground_layers(chronology).items()}
+        middle, reach = extent_of(ground[0])
         up = up_direction([shot.camera for shot in self._shots if shot.camera is not None])
         scene.set_up_direction(tuple(up))
-        _add_splats(scene, "background", background)
+        self._ground = {t: _add_splats(scene, f"background_{t}", layer) for t, layer in ground.items()}
         self._layers = [layer_of(template.splats) for template in chronology.templates]
         self._objects = [_add_splats(scene, f"template_{k}", layer) for k, layer in enumerate(self._layers)]
         self._frusta = {shot.name: self._add_frustum(shot, 0.12 * reach) for shot in self._shots}
@@ -184,6 +184,8 @@ class Viewer:
 
     def _place_objects(self, moment: float) -> None:
         with self.server.atomic():
+            for since, handle in self._ground.items():
+                handle.visible = since <= moment
             for k, (template, handle) in enumerate(zip(self._chronology.templates, self._objects, strict=True)):
                 place = place_at(self._chronology, k, moment)
                 handle.wxyz, handle.position = place.wxyz, place.xyz
