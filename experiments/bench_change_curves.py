@@ -1,4 +1,4 @@
-"""The points of `bench_change curves`: change masks of one later visit against a ray-cast truth, one setting each.
+"""The points of `bench_change curves`: changed pixels of one later visit against a ray-cast truth, one setting each.
 
 Every point starts from one initial scene. The photographs of visit 1 are compared with it one by one, as
 `pipeline.looks.compare` does, or, for the number of views, together, as `pipeline.visit.explain_visit` does: there

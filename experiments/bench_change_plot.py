@@ -18,25 +18,32 @@ _DPI = 100
 
 
 def draw_curves(curves: dict[str, Points], path: Path) -> None:
-    """F1 of the changed pixels against threshold, noise, light, number of photographs and time; 900 px wide."""
+    """Shares of the changed pixels against threshold, noise, light, number of photographs and time; 900 px wide."""
     layout = [["threshold", "noise"], ["light", "light"], ["views", "front end"]]
     figure, axes = plt.subplot_mosaic(layout, figsize=(_PIXELS / _DPI, 10.5), layout="constrained")
     _lines(axes["threshold"], curves["threshold"], ("f1", "precision", "recall"))
-    _mark(axes["threshold"], DetectConfig().sigmas, "default")
-    axes["threshold"].set(xlabel="threshold, robust standard deviations", title="Threshold")
+    axes["threshold"].axvline(DetectConfig().sigmas, color="gray", linestyle=":")
+    axes["threshold"].set(xlabel="threshold, robust standard deviations", title="Threshold\n(dotted: the default)")
     _lines(axes["noise"], curves["noise"], ("f1", "matching_precision"))
     half = halving_noise(curves["noise"])
+    title = "Noise on the features"
     if np.isfinite(half):
-        _mark(axes["noise"], half, f"σ = {half:.2f} halves\nthe matching precision")
-    axes["noise"].set(xlabel="noise on descriptors, σ in shares of their norm", title="Noise on the features")
+        axes["noise"].axvline(half, color="gray", linestyle=":")
+        title += f"\n(dotted: σ = {half:.2f}, half as many matches right)"
+    axes["noise"].set(xlabel="noise on descriptors, σ in shares of their norm", title=title)
     _bars(axes["light"], {"taken out": curves["light"], "left in": curves["light, not taken out"]})
     axes["light"].set(xlabel="light of the photographs", title="Light")
     _lines(axes["views"], curves["views"], ("f1", "precision", "recall"))
-    axes["views"].set(xlabel="photographs explained together", ylabel="F1 at held-out cameras", title="Number of views")
+    title = "Number of views\n(objects, at held-out cameras)"
+    axes["views"].set(xlabel="photographs explained together", title=title)
     axes["views"].set_xticks([value for value, _ in curves["views"]])
     _times(axes["front end"], curves["front end"])
-    for name in ("threshold", "noise", "light", "front end"):
-        axes[name].set_ylabel("share of pixels" if name in ("threshold", "noise") else "F1 of changed pixels")
+    plt.setp([axis.title for axis in axes.values()], fontsize=11)
+    for name in ("light", "front end"):
+        axes[name].set_ylabel("F1 of changed pixels")
+    for name in ("threshold", "views"):
+        axes[name].set_ylabel("share of changed pixels")
+    axes["noise"].set_ylabel("share of pixels, of matches")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=_DPI)
     plt.close(figure)
@@ -55,12 +62,6 @@ def _lines(axis, points: Points, keys: tuple[str, ...]) -> None:
     axis.legend(loc="upper center", ncols=3, fontsize=9)
 
 
-def _mark(axis, value: float, text: str) -> None:
-    """A vertical line with what it is, at its foot."""
-    axis.axvline(value, color="gray", linestyle=":")
-    axis.annotate(text, (value, 0.03), xytext=(5, 0), textcoords="offset points", fontsize=9, color="dimgray")
-
-
 def _bars(axis, sets: dict[str, Points]) -> None:
     """A group of bars per light."""
     width = 0.8 / len(sets)
@@ -75,11 +76,11 @@ def _bars(axis, sets: dict[str, Points]) -> None:
 
 
 def _times(axis, points: Points) -> None:
-    """F1 against time, a labelled point per front end."""
+    """F1 against time, a point per front end; the legend below them."""
     seconds = [row["seconds_image"] for _, row in points]
     for (name, row), second in zip(points, seconds, strict=True):
-        axis.plot(second, row["f1"], "o", markersize=7)
-        axis.annotate(name, (second, row["f1"]), xytext=(0, 8), textcoords="offset points", ha="center", fontsize=9)
-    axis.set(xscale="log", xlim=(min(seconds) / 3, max(seconds) * 3), ylim=(0, 1.05), title="Time")
-    axis.set_xlabel("CPU seconds per photograph of 240×180")
-    axis.grid(alpha=0.3, which="both")
+        axis.plot(second, row["f1"], "o", markersize=8, alpha=0.8, label=name)
+    axis.set(xlim=(0, 1.15 * max(seconds)), ylim=(0, 1.05), title="Front ends")
+    axis.set_xlabel("CPU seconds per photograph")
+    axis.grid(alpha=0.3)
+    axis.legend(loc="lower center", ncols=1, fontsize=9)
