@@ -40,6 +40,7 @@ from ltgs_jax.io import (
 )
 from ltgs_jax.localize import LocalizeConfig, localize
 from ltgs_jax.metrics import flip, psnr, ssim
+from ltgs_jax.pipeline.evaluate import changed_names, read_truth
 from ltgs_jax.pipeline.looks import Eye
 from ltgs_jax.scene import Splats
 
@@ -100,7 +101,7 @@ def load_problem(config: SceneConfig, cache: Path) -> Problem:
     capture = read_capture(folder)
     found = localize(capture, config=LocalizeConfig())
     capture = found.apply(capture)
-    truth = _read_truth(folder)
+    truth = read_truth(folder)
 
     def view(p: Photograph) -> View:
         image = load_image(p, max_side=config.max_side)
@@ -127,23 +128,15 @@ def load_problem(config: SceneConfig, cache: Path) -> Problem:
     )
 
 
-def _read_truth(folder: Path) -> dict | None:
-    path = folder / "truth" / "objects.json"
-    return json.loads(path.read_text()) if path.is_file() else None
-
-
 def _changed_region(truth: dict | None, photograph: Photograph, camera: Camera, config: SceneConfig):
     """Where a thing is that moved or came, and where one stood at the first visit that moved or left."""
     if truth is None:
         return None
-    first, now = ({k: np.asarray(m) for k, m in truth["times"][t].items()} for t in (0, photograph.visit))
-    names = [
-        n for n in first.keys() | now.keys() if n not in first or n not in now or not np.allclose(first[n], now[n])
-    ]
-    folder = Path(photograph.path).parents[2]
-    labels = read_labels(folder / "truth" / "masks" / Path(photograph.name).with_suffix(".png"))
+    first = {name: np.asarray(pose) for name, pose in truth["times"][0].items()}
+    names = changed_names(truth, 0, photograph.visit)
+    labels = read_labels(truth["masks"] / Path(photograph.name).with_suffix(".png"))
     region = np.isin(labels, [truth["ids"][name] for name in names]).astype(np.uint8)
-    for name in set(names) & first.keys():
+    for name in names & first.keys():
         corners = np.stack(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [0.0, 1.0]), axis=-1).reshape(-1, 3)
         world = corners * np.asarray(truth["extents"][name]) @ first[name][:3, :3].T + first[name][:3, 3]
         xy, z = camera.project(jnp.asarray(world, jnp.float32))

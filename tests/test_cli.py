@@ -75,9 +75,12 @@ _RECORD = {
 @pytest.fixture
 def pipeline(monkeypatch):
     """A pipeline whose functions record what they were called with, and fail when told to."""
+    from ltgs_jax.pipeline.config import for_small_photographs
+
     fake = types.ModuleType("ltgs_jax.pipeline")
     fake.Config = _Config
     fake.PRESETS = {"fast": _Config(), "tiny": _Config(fit=_Fit(_Initial(steps=7))), "paper": _Config()}
+    fake.for_small_photographs = for_small_photographs
     fake.calls = []
     fake.error = None
 

@@ -11,13 +11,13 @@ Stages that an ablation shares with the plain run are taken from it, so that one
 alone; the seconds in the row are those that the stages took when they ran.
 """
 
-import dataclasses
 import json
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.engine import vary
+from experiments.front_ends import Noisy
 from experiments.scenes import SceneConfig, bytes_of, initial_scene, load_problem, per_visit_answer, score
 from ltgs_jax.io import load_chronology
 from ltgs_jax.pipeline import PRESETS, update
@@ -45,7 +45,7 @@ class SystemConfig:
         return f"{self.scene.capture.label} {' '.join(f'{k}={v}' for k, v in self.overrides)}"
 
 
-class _Silent:
+class Silent:
     """A progress that says nothing."""
 
     def stage(self, name: str) -> None: ...
@@ -68,14 +68,12 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     kept = cache / "stages" / f"{problem.folder.name}_{config.preset}_{config.seed}_{initial_path.parent.name}"
     if kept.is_dir() and not out.exists() and config.feature_noise == 0:
         shutil.copytree(kept, out / "stages")
-    noise = {"front_end": _noisy(config)} if config.feature_noise > 0 else {}
+    noise = {"front_end": Noisy(sigma=config.feature_noise)} if config.feature_noise > 0 else {}
     chronology = update(
-        problem.folder, out, config=options, initial=initial_path, seed=config.seed, progress=_Silent(), **noise
+        problem.folder, out, config=options, initial=initial_path, seed=config.seed, progress=Silent(), **noise
     )
     if not config.overrides and not kept.exists() and config.feature_noise == 0:
         shutil.copytree(out / "stages", kept)
-    stages = {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
-    counted = [row for name, row in stages.items() if name not in ("outputs", "evaluate")]
     said = {m["key"]: m["value"] for m in json.loads((out / "metrics.json").read_text()) if m["visit"] is None}
     scenes = [drop_hidden(compose(chronology, t)) for t in range(len(problem.visits))]
     loaded = load_chronology(out)
@@ -84,32 +82,18 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     row = score(problem, per_visit_answer(scenes, bytes_of(loaded), said), folder)
     return {
         **row,
-        "seconds": sum(stage["seconds"] for stage in counted),
-        "seconds_cpu": sum(stage["cpu_seconds"] for stage in counted),
-        "seconds_compile": sum(stage["compile_seconds"] for stage in counted),
+        **stage_seconds(out),
         "seconds_initial": initial_seconds["seconds_cpu"],
-        **{f"seconds_stage_{name}": stage["cpu_seconds"] for name, stage in stages.items()},
     }
 
 
-def _noisy(config: SystemConfig):
-    """The default front end with noise on its dense descriptors, the same for the same image."""
-    import zlib
-
-    import numpy as np
-
-    from ltgs_jax.features import Classical
-
-    class Noisy(Classical):
-        def fingerprint(self) -> str:
-            return f"{super().fingerprint()} noise {config.feature_noise}"
-
-        def describe(self, image):
-            dense = super().describe(image)
-            rng = np.random.default_rng(zlib.crc32(np.ascontiguousarray(image).tobytes()))
-            shape = dense.features.shape
-            features = dense.features + config.feature_noise / np.sqrt(shape[-1]) * rng.standard_normal(shape)
-            features = features / np.linalg.norm(features, axis=-1, keepdims=True)
-            return dataclasses.replace(dense, features=features.astype(np.float32))
-
-    return Noisy()
+def stage_seconds(out: Path) -> dict[str, float]:
+    """The seconds that the stages of a chronology took when they ran: all but the outputs', and the CPU's of each."""
+    stages = {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
+    counted = [row for name, row in stages.items() if name not in ("outputs", "evaluate")]
+    return {
+        "seconds": sum(stage["seconds"] for stage in counted),
+        "seconds_cpu": sum(stage["cpu_seconds"] for stage in counted),
+        "seconds_compile": sum(stage["compile_seconds"] for stage in counted),
+        **{f"seconds_stage_{name}": stage["cpu_seconds"] for name, stage in stages.items()},
+    }

@@ -32,20 +32,9 @@ def _demo(options: Demo) -> None:
     capture = options.out / "capture"
     with _reporting() as progress:
         _make_demo_capture(capture, options, progress)
-        config = _for_small_photographs(pipeline.PRESETS[options.preset])
+        config = pipeline.for_small_photographs(pipeline.PRESETS[options.preset])
         pipeline.update(capture, options.out, config=config, seed=options.seed, progress=progress)
     _finish(options.out, read_json(options.out / "metrics.json", list))
-
-
-def _for_small_photographs(config: Any) -> Any:
-    """Fewer steps and splats: the built-in captures are 240 × 180 pixels, the presets are made for 640.
-
-    All steps at full size: a coarse start costs more to compile here than it saves.
-    """
-    initial = config.fit.initial
-    steps, splats = min(initial.steps, 500), min(initial.max_splats, 15_000)
-    initial = replace(initial, steps=steps, max_splats=splats, coarse_fraction=0.0)
-    return replace(config, fit=replace(config.fit, initial=initial))
 
 
 def _make_demo_capture(folder: Path, options: Demo, progress: Reporter) -> None:

@@ -3,11 +3,13 @@
 import dataclasses
 import functools
 import os
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 
+from ltgs_jax.geometry import Camera
 from ltgs_jax.io import (
     CameraModel,
     ColmapImage,
@@ -143,6 +145,23 @@ def _develop(film: np.ndarray, rng: np.random.Generator, *, changed_light: bool)
     image = np.clip(film, 0, 1) ** (1 / 2.2)
     image = image + contrast * (image * image * (3 - 2 * image) - image)
     return image + _NOISE * rng.standard_normal(image.shape)
+
+
+def object_ids(scene: str, seed: int, t: int, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """The object that each pixel of any cameras shows at visit t of a made-up room: ids [h w] as in truth/masks.
+
+    `scene`, `seed` and the errors are those of `make_capture`.
+    """
+    rng = np.random.default_rng([seed, 7])
+    story = tell(scene, rng)
+    caster, owners = _set_stage(story, t, make_room(rng))
+    ids = []
+    for camera in cameras:
+        (fx, _, cx), (_, fy, cy), _ = np.asarray(camera.K, float).tolist()
+        lens = CameraModel("PINHOLE", camera.width, camera.height, (fx, fy, cx, cy))
+        pose = np.asarray(camera.cam_from_world.as_matrix(), float)
+        ids.append(_owner_image(caster, owners, View(pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]), lens))
+    return ids
 
 
 def _sparse_points(

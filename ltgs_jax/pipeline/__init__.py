@@ -2,6 +2,7 @@
 
 from .config import PRESETS as PRESETS
 from .config import Config as Config
+from .config import for_small_photographs as for_small_photographs
 from .evaluate import evaluate as evaluate
 from .exports import FORMATS as FORMATS
 from .exports import export as export

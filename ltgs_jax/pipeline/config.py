@@ -65,6 +65,17 @@ PRESETS: dict[str, Config] = {
 }
 
 
+def for_small_photographs(config: Config) -> Config:
+    """Fewer steps and splats: the built-in captures are 240 × 180 pixels, the presets are made for 640.
+
+    All steps at full size: a coarse start costs more to compile here than it saves.
+    """
+    initial = config.fit.initial
+    steps, splats = min(initial.steps, 500), min(initial.max_splats, 15_000)
+    initial = replace(initial, steps=steps, max_splats=splats, coarse_fraction=0.0)
+    return replace(config, fit=replace(config.fit, initial=initial))
+
+
 _LEAST = {"io.max_side": 16, "fit.initial.max_splats": 4, "fit.initial.steps": 1, "fit.initial.grow_every": 1}
 _MOST = {"fit.initial.sh_degree": 3}
 

@@ -39,7 +39,7 @@ def evaluate(out_dir: str | Path, capture_dir: str | Path | None) -> list[dict]:
     recorded, cameras = read_cameras(out)
     capture = read_capture(capture_dir if capture_dir is not None else recorded)
     tracks = read_tracks(out / "tracks.json")
-    truth = _truth(capture.folder)
+    truth = read_truth(capture.folder)
     rows = []
     manifest = read_json(out / "report.json")["photographs"]
     photographs = {p.name: p for p in capture.photographs}
@@ -96,7 +96,7 @@ def _scores(image, target, mask) -> dict[str, float]:
     }
 
 
-def _truth(folder: Path) -> dict | None:
+def read_truth(folder: Path) -> dict | None:
     """The truth that a made-up capture carries: ids, extents, poses per visit, and the folder of its masks."""
     path = folder / "truth" / "objects.json"
     if not path.is_file():
@@ -109,7 +109,7 @@ def _poses(truth: dict, t: int) -> dict[str, np.ndarray]:
     return {name: np.asarray(matrix, float) for name, matrix in truth["times"][t].items()}
 
 
-def _changed_names(truth: dict, a: int, b: int) -> set[str]:
+def changed_names(truth: dict, a: int, b: int) -> set[str]:
     """Objects that are not the same at visits a and b."""
     before, after = _poses(truth, a), _poses(truth, b)
     return {
@@ -124,7 +124,7 @@ def _changed_region(out: Path, entry: dict, truth, camera: Camera, rendered, unt
     t = entry["visit"]
     if truth is None:
         return dilate(np.abs(rendered - untouched).max(axis=-1) > 0.08, _MARGIN)
-    names = _changed_names(truth, 0, t)
+    names = changed_names(truth, 0, t)
     labels = read_labels(truth["masks"] / Path(entry["name"]).with_suffix(".png"))
     region = np.isin(labels, [truth["ids"][name] for name in names])
     for name, pose in _poses(truth, 0).items():
@@ -148,7 +148,7 @@ def _box_outline(pose: np.ndarray, extents: np.ndarray, camera: Camera) -> Bool[
 def _truth_scores(out: Path, capture, tracks: dict, truth: dict, manifest: list[dict]) -> list[dict]:
     """Masks, identities, events and poses against the truth."""
     visits = range(1, len(capture.visits))
-    ever = set().union(*[_changed_names(truth, t - 1, t) for t in visits]) if len(capture.visits) > 1 else set()
+    ever = set().union(*[changed_names(truth, t - 1, t) for t in visits]) if len(capture.visits) > 1 else set()
     ids = truth["ids"]
     found_labels, true_labels = [], []
     for entry in manifest:
@@ -220,7 +220,7 @@ def _true_events(truth: dict, visits: int) -> dict[tuple[int, int], str]:
     events = {}
     for t in range(1, visits):
         before, after = _poses(truth, t - 1), _poses(truth, t)
-        for name in _changed_names(truth, t - 1, t):
+        for name in changed_names(truth, t - 1, t):
             kind = "added" if name not in before else "removed" if name not in after else "moved"
             events[truth["ids"][name], t] = kind
     return events

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ltgs_jax.detect import fit_tone, similarity
+from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
 from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
 from ltgs_jax.geometry import SE3, Camera
@@ -37,7 +37,7 @@ from ltgs_jax.scene import Chronology
 from .config import Config, check_config
 from .evaluate import evaluate
 from .hold import only_run
-from .looks import Eye, Observation
+from .looks import Eye, Observation, expected_errors
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
@@ -228,16 +228,8 @@ def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye,
                 start, views, key=jax.random.key(run.seed), config=config.fit.initial, progress=progress.step
             ).splats
         progress.note("measuring what difference is to be expected")
-        sample = views[:: max(1, len(views) // 12)]
-        votes = np.zeros((splats.count, 2))
-        for view in sample:
-            image = view.image.astype(np.float32) / 255
-            rendered = eye.image(splats, view.camera)
-            unlike = 1 - similarity(rendered, image, front_end, gamma=config.detect.gamma)
-            votes += eye.votes(splats, view.camera, np.stack([unlike * view.mask, view.mask], axis=-1))
-        # A prior of two pixels that disagree by half: what the photographs hardly showed is not to be relied on.
-        errors = (votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)
-        return {**pack_splats("", splats), "errors": errors.astype(np.float32)}, {"counts": {"splats": splats.count}}
+        errors = expected_errors(eye, splats, views, front_end, gamma=config.detect.gamma)
+        return {**pack_splats("", splats), "errors": errors}, {"counts": {"splats": splats.count}}
 
     arrays, _ = store.run("initial", key, compute)
     return unpack_splats("", arrays), arrays["errors"]
