@@ -378,7 +378,7 @@ def test_the_demo_makes_its_capture_once(pipeline, tmp_path, monkeypatch, capsys
     for _ in range(2):
         assert main(["demo", "--out", str(tmp_path), "--scene", "move", "--seed", "4", "--preset", "tiny"]) == 0
     assert made == [("move", 4)]
-    small = _Fit(_Initial(steps=7, coarse_fraction=0.0), _Long(150))  # no more than the small photographs need
+    small = _Fit(_Initial(steps=7, coarse_fraction=0.0), _Long(300))  # no more than the small photographs need
     assert pipeline.calls[0][3].fit == small
     assert pipeline.calls[0] == pipeline.calls[1] and pipeline.calls[0][1:3] == (tmp_path / "capture", tmp_path)
     capsys.readouterr()

@@ -19,6 +19,10 @@ from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likenes
 from .support import Support, Vantage, fit_support, rotation_about
 
 _TURNS = 12  # in place, of what was found
+_PARALLEL = np.radians(8)  # between the normals of two surfaces, up to which they are taken for parallel
+_LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other than this are taken for one
+_LEANS = np.radians(20)  # from the normal, beyond which something lies on another side
+_LEVEL_MARGIN = 0.03  # by which it may look worse upright and still be taken to stand so
 _AGREE = 0.06  # difference of colours at which two photographs hardly show one surface
 
 
@@ -114,11 +118,12 @@ def thin(splats: Splats, most: int) -> Splats:
 
 
 class Search(eqx.Module):
-    """Promising poses of a template on a surface of unit `normal`, and the mean unlikeness with it at each, in coarse
+    """Promising poses of a template, from one surface to another, and the mean unlikeness with it at each, in coarse
     windows; the error `without` it, and the part of that which is to be explained."""
 
     template: Splats
-    normal: Float[np.ndarray, "3"]
+    stood_on: Support
+    stands_on: Support
     poses: SE3
     errors: Float[np.ndarray, " m"]
     without: float
@@ -150,7 +155,7 @@ def search_template(
     best few, unlike each other.
     """
     light = thin(template.splats, config.search_splats)
-    points = np.asarray(light.means, np.float64)[np.asarray(light.opacities) > 0.1]
+    points = _shown_points(light)
     coarse = half_crop(crop)
     without, change = backdrop_error(coarse)
     best: Search | None = None
@@ -164,7 +169,7 @@ def search_template(
             light, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, tolerance=0.1 * size, rng=rng
         )
         order = np.argsort(errors, kind="stable")
-        found = Search(light, stands_on.normal, poses[order], errors[order], without, change)
+        found = Search(light, stood_on, stands_on, poses[order], errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():
             best = found
         if upright or best.best_gain > config.tau_search:
@@ -175,17 +180,54 @@ def search_template(
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
     """Refine the best two poses of a search on the pixels, in all six freedoms, then the best two turns in place of
-    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell."""
+    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. It
+    stands upright, as it stood, unless the pixels clearly say that it leans.
+    """
     options = {"size": size, "tolerance": 0.1 * size, "blurred": 3}
     found = refiner.refine(search.template, search.poses[:2], crop, steps=12, **options)
     best = int(np.argmin(found.errors))
-    turned = turned_round(found.poses[best], search.template, search.normal, _TURNS)[1:]
+    turned = turned_round(found.poses[best], search.template, search.stands_on.normal, _TURNS)[1:]
     scores = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
     other = refiner.refine(search.template, turned[np.argsort(scores, kind="stable")[:2]], crop, steps=8, **options)
-    pose = found.poses[best]
-    if other.errors.min() < found.errors[best]:
-        pose = other.poses[int(np.argmin(other.errors))]
+    pose, error = found.poses[best], found.errors[best]
+    if other.errors.min() < error:
+        pose, error = other.poses[int(np.argmin(other.errors))], other.errors.min()
+    upright = _levelled(pose, search)
+    if upright is not None:
+        turning = search.stood_on.normal
+        level = refiner.refine(search.template, upright[None], crop, steps=12, turning=turning, **options)
+        if level.errors[0] < error * (1 + _LEVEL_MARGIN):
+            pose = level.poses[0]
     return place_template(search, pose, crop, size=size, refiner=refiner)
+
+
+def _shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:
+    """Centres of the splats that show: a thinned template ends in ones that do not."""
+    return np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.1]
+
+
+def _levelled(pose: SE3, search: Search) -> SE3 | None:
+    """A pose with what it leans turned back, as high above the surface as it stood; None where it leans far, on another
+    side.
+
+    Two surfaces that agree at its new place but for a little are one: the difference is that of their estimates.
+    """
+    matrix = np.asarray(pose.as_matrix(), np.float64)
+    stood, stands = search.stood_on, search.stands_on
+    before = middle_of(_shown_points(search.template))
+    middle = matrix[:3, :3] @ before + matrix[:3, 3]
+    height = stood.height(before[None])[0]
+    apart = abs(stood.height(middle[None])[0] - stands.height(middle[None])[0])
+    if stood.normal @ stands.normal > np.cos(_PARALLEL) and apart < _LEVEL_APART * abs(height):
+        stands = stood
+    leaning = matrix[:3, :3] @ stood.normal
+    if leaning @ stands.normal < np.cos(_LEANS):
+        return None
+    back = rotation_between(leaning, stands.normal)
+    rise = (height - stands.height(middle[None])[0]) * stands.normal
+    matrix[:3, 3] = back @ (matrix[:3, 3] - middle) + middle + rise
+    matrix[:3, :3] = back @ matrix[:3, :3]
+    return SE3.from_matrix(jnp.asarray(matrix, jnp.float32))
 
 
 def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> Placement:

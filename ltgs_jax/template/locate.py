@@ -327,9 +327,19 @@ class Refiner:
         return SE3.from_matrix(jnp.asarray(best, jnp.float32)), best_errors
 
     def refine(
-        self, template: Splats, poses: SE3, crop: Crop, *, size: float, tolerance: float, steps: int, blurred: int = 0
+        self,
+        template: Splats,
+        poses: SE3,
+        crop: Crop,
+        *,
+        size: float,
+        tolerance: float,
+        steps: int,
+        blurred: int = 0,
+        turning: Float[np.ndarray, "3"] | None = None,
     ) -> Refinement:
-        """Descend from each of m poses. `size`: the template's diameter in scene units.
+        """Descend from each of m poses. `size`: the template's diameter in scene units; `turning`: the axis in the
+        template's frame about which alone it may turn, or None for all three.
 
         Residuals are differences of colour and of grey detail with Geman–McClure weights (scale 0.15); the first
         `blurred` steps see them blurred, which widens the basin. A step that does not pay is taken back and damped
@@ -341,6 +351,8 @@ class Refiner:
         damping = np.full(m, 1e-2)
         best = jax.tree.map(np.asarray, poses)
         best_cost, best_errors = np.full(m, np.inf), np.full(m, np.inf)
+        # Columns: the freedoms as tangents.
+        freedoms = np.eye(6) if turning is None else np.c_[np.eye(6)[:, :3], np.r_[np.zeros(3), turning]]
         normal = np.zeros((m, 6, 6))
         slope = np.zeros((m, 6))
         trial = poses
@@ -389,7 +401,8 @@ class Refiner:
             scale = np.einsum("mii->mi", normal)
             scale = scale + 1e-9 * scale.max(axis=1, keepdims=True) + 1e-12
             system = normal + (damping[:, None] * scale)[:, :, None] * np.eye(6)
-            move = -np.linalg.solve(system, slope[..., None])[..., 0]
+            system, downhill = freedoms.T @ system @ freedoms, -(slope @ freedoms)
+            move = np.linalg.solve(system, downhill[..., None])[..., 0] @ freedoms.T
             # No step leaves the region in which a linearisation of pixels can mean anything.
             move[:, :3] = np.clip(move[:, :3], -0.15 * size, 0.15 * size)
             move[:, 3:] = np.clip(move[:, 3:], -0.3, 0.3)
