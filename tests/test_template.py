@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ltgs_jax.geometry import C0, SE3, Camera, rotation_angle, stack_cameras
 from ltgs_jax.match import Cone
@@ -20,7 +21,7 @@ from ltgs_jax.template import (
     search_template,
     settle_template,
 )
-from ltgs_jax.template.arrival import pose_hypotheses, tilts_of
+from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.removal import gone_evidence
@@ -260,3 +261,25 @@ def test_photographs_agree_on_the_surface_and_not_before_or_behind_it():
     by_height = np.median(spread.reshape(solid.shape), axis=(0, 1))
     assert int(np.argmin(by_height)) == 5  # z = 0
     assert by_height[5] < 0.5 * np.min(by_height[[0, 1, 2, 8, 9, 10]])
+
+
+def test_what_leans_a_little_is_stood_upright_at_its_height():
+    rng = np.random.default_rng(3)
+    box = _splats(rng.uniform([0.4, 0.2, 0.0], [0.6, 0.3, 0.12], (200, 3)), np.zeros((200, 3)), 0.01)
+    table = Support(np.asarray([0.0, 0, 1]), 0.0, 1e-3)
+    nearly = Support(np.asarray([0.0, np.sin(0.03), np.cos(0.03)]), 0.01, 1e-3)  # the same table, badly seen
+    thinned = thin(box, 300)  # ends in invisible splats at the origin, which say nothing of where the box is
+    poses = SE3.identity((1,), jnp.float32)
+    search = Search(thinned, table, nearly, poses, np.zeros(1), 1.0, 1.0)
+    middle = np.r_[middle_of(np.asarray(box.means, np.float64)), 1]
+    for degrees in (0.0, 5.0, -12.0):
+        turn = Rotation.from_euler("zx", [40, degrees], degrees=True).as_matrix()
+        leaning = np.eye(4)
+        leaning[:3, :3] = turn
+        leaning[:3, 3] = [0.3, -0.2, 0.02]
+        level = np.asarray(levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), search).as_matrix(), np.float64)
+        np.testing.assert_allclose(level[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=1e-6)
+        np.testing.assert_allclose((level @ middle)[:2], (leaning @ middle)[:2], atol=1e-6)
+        np.testing.assert_allclose((level @ middle)[2], middle[2], atol=1e-6)
+    leaning[:3, :3] = Rotation.from_euler("x", 60, degrees=True).as_matrix()
+    assert levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), search) is None

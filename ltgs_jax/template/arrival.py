@@ -192,7 +192,7 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     pose, error = found.poses[best], found.errors[best]
     if other.errors.min() < error:
         pose, error = other.poses[int(np.argmin(other.errors))], other.errors.min()
-    upright = _levelled(pose, search)
+    upright = levelled(pose, search)
     if upright is not None:
         turning = search.stood_on.normal
         level = refiner.refine(search.template, upright[None], crop, steps=12, turning=turning, **options)
@@ -206,7 +206,7 @@ def _shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:
     return np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.1]
 
 
-def _levelled(pose: SE3, search: Search) -> SE3 | None:
+def levelled(pose: SE3, search: Search) -> SE3 | None:
     """A pose with what it leans turned back, as high above the surface as it stood; None where it leans far, on another
     side.
 
