@@ -367,6 +367,7 @@ def _add_new(
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
     views = arrival.instance.views
+    height = arrival.support.height(np.asarray(splats.means, np.float64))
     bared = arrival.bared > _BARED
     ground, shade = ground_shade(splats[new.firm], arrival.support, state.chronology.background, bared=arrival.bared)
     if ground or (ground is None and bared):
@@ -374,9 +375,10 @@ def _add_new(
             progress.note(f"visit {t}: a shadow in {views} photographs, left out")
             return state, None
         progress.note(f"visit {t}: ground that was hidden before, from {views} photographs")
-        return _with_ground(state, t, splats, doubt), None
+        flat = height < _LOW * template_diameter(splats)  # what floats above it is no ground
+        return _with_ground(state, t, splats[flat], doubt), None
     object_splats = splats[new.firm]
-    low = arrival.support.height(np.asarray(splats.means, np.float64)) < _LOW * template_diameter(object_splats)
+    low = height < _LOW * template_diameter(object_splats)
     state = _with_ground(state, t, splats[~new.firm & low], doubt)
     whole = _part_of(state, t, object_splats)
     if whole is not None:
