@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from experiments.engine import Run, mean_of
 
 BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
@@ -145,7 +147,7 @@ def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
 
 
 def _stability(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
-    """Per driver a table of error growth, and one plot for all."""
+    """Per driver a table of error growth, and a panel of one plot."""
     drivers: dict[str, list[dict]] = {}
     for name, runs in sheet.runs.items():
         drivers.setdefault(name.partition(": ")[0], []).extend(_done(runs, rows))
@@ -158,7 +160,8 @@ def _stability(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
             [found[0]["driver_unit"], *(key.removeprefix("of ") for key in keys)],
             [[f"{row['driver_value']:g}", *(_number(row.get(key)) for key in keys)] for row in found],
         )
-        lines[driver] = [(row["driver_value"], row[keys[0]]) for row in found if isinstance(row.get(keys[0]), float)]
+        what = f"{driver} [{found[0]['driver_unit']}]", keys[0].removeprefix("of ")
+        lines[what] = [(row["driver_value"], row[keys[0]]) for row in found if isinstance(row.get(keys[0]), float)]
     return text + _growth({k: v for k, v in lines.items() if len(v) > 1}, images / "results_stability.png")
 
 
@@ -166,14 +169,14 @@ def _number(value: object) -> str:
     return f"{value:.2g}" if isinstance(value, float) else str(value if value is not None else "–")
 
 
-def _axes(path: Path):
+def _axes(path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float] = (6.4, 4.2)):
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    return plt.subplots(figsize=(6.4, 4.2))
+    return plt.subplots(rows, columns, figsize=size)
 
 
 def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) -> str:
@@ -193,16 +196,24 @@ def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) 
     return f"\n![{y} against {x}](images/{path.name})\n"
 
 
-def _growth(lines: dict[str, list[tuple[float, float]]], path: Path) -> str:
+def _growth(lines: dict[tuple[str, str], list[tuple[float, float]]], path: Path) -> str:
+    """A panel per driver: its value against the first error of its table."""
     if not lines:
         return ""
-    figure, axes = _axes(path)
-    for name, pairs in lines.items():
+    columns = min(3, len(lines))
+    count = -(-len(lines) // columns)
+    figure, axes = _axes(path, count, columns, (3.4 * columns, 2.6 * count))
+    panels = np.atleast_1d(axes).ravel()
+    for ax, ((driver, error), pairs) in zip(panels, lines.items(), strict=False):
         positive = [(max(a, 1e-9), max(b, 1e-9)) for a, b in pairs]
-        axes.loglog(*zip(*positive, strict=True), "o-", label=name)
-    axes.set(xlabel="driver", ylabel="first error of its table")
-    axes.legend(fontsize=7)
-    figure.savefig(path, dpi=80, bbox_inches="tight")
+        ax.loglog(*zip(*positive, strict=True), "o-", color="tab:brown", markersize=4)
+        ax.set_xlabel(driver, fontsize=8)
+        ax.set_ylabel(error, fontsize=8)
+        ax.tick_params(labelsize=7)
+    for ax in panels[len(lines) :]:
+        ax.set_visible(False)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
     return f"\n![Error growth over each driver](images/{path.name})\n"
 
 
