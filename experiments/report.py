@@ -207,6 +207,10 @@ def _growth(lines: dict[tuple[str, str], list[tuple[float, float]]], path: Path)
     for ax, ((driver, error), pairs) in zip(panels, lines.items(), strict=False):
         positive = [(max(a, 1e-9), max(b, 1e-9)) for a, b in pairs]
         ax.loglog(*zip(*positive, strict=True), "o-", color="tab:brown", markersize=4)
+        low, high = min(b for _, b in positive), max(b for _, b in positive)
+        room = max(100 / (high / low), 4) ** 0.5  # two decades at least, so that noise does not look like growth
+        ax.set_ylim(low / room, high * room)
+        ax.minorticks_off()
         ax.set_xlabel(driver, fontsize=8)
         ax.set_ylabel(error, fontsize=8)
         ax.tick_params(labelsize=7)
