@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from ltgs_jax.fit import template_diameter
@@ -13,6 +14,10 @@ from .config import Config
 from .ground import ground_shade
 from .looks import Evidence, Eye, Observation, on_host, projection_of, vantage_of
 from .state import State, add_template, cut_background, extend_background, extend_template, next_identity, set_from
+
+_LEAST_SEEN = 0.3  # pixels (αT) from which on a splat is seen
+_CHANGED = 0.6  # share of them that changed, from which on it may be a streak of what left
+_CLOSE = 0.15  # distance from that, in its sizes
 
 
 def take_out(
@@ -34,7 +39,7 @@ def take_out(
     """
     splats, _, owner, _ = scene
     votes = [
-        eye.votes(splats, o.camera, np.stack([o.valid, change.left * o.valid], axis=-1))
+        eye.votes(splats, o.camera, np.stack([o.valid, change.left * o.valid, change.mask * o.valid], axis=-1))
         for o, change in zip(observations, evidence.changes, strict=True)
     ]
     seen, told = np.stack([v[:, 0] for v in votes]), np.stack([v[:, 1] for v in votes])
@@ -56,10 +61,41 @@ def take_out(
         rng=rng,
         config=config.template,
     )
-    return _cut_out(state, t, gone, removals, observations, config)
+    streaks = _streaks(state, t, gone, seen[:, base].sum(axis=0), sum(v[base, 2] for v in votes))
+    return _cut_out(state, t, gone, removals, streaks, observations, config)
 
 
-def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observations, config: Config):
+def _streaks(
+    state: State, t: int, gone, seen: Float[np.ndarray, " n"], changed: Float[np.ndarray, " n"]
+) -> dict[int, Bool[np.ndarray, " n"]]:
+    """Background splats in or close around what was cut out before in this visit, clear of the ground and changed
+    wherever they show: smooth ones, which no detail tells from something that came."""
+    means = np.asarray(state.chronology.background.means, np.float64)
+    free = (seen > _LEAST_SEEN) & (changed > _CHANGED * seen)
+    found = {}
+    for k in gone:
+        support = state.supports[k]
+        if support is None or not _stood_here(state, t, k):
+            continue
+        body = np.asarray(state.chronology.templates[k].splats.means, np.float64)
+        clear = support.height(means) > 0.15 * np.quantile(support.height(body), 0.95)
+        rows = np.flatnonzero(free & clear)
+        reach = _CLOSE * template_diameter(state.chronology.templates[k].splats)
+        near = rows[cKDTree(body).query(means[rows])[0] < reach]
+        if len(near):
+            found[k] = np.isin(np.arange(len(means)), near)
+            free &= ~found[k]
+    return found
+
+
+def _stood_here(state: State, t: int, k: int) -> bool:
+    """Whether a template left from where the first visit saw it."""
+    template = state.chronology.templates[k]
+    hidden = not bool(np.asarray(state.chronology.visible)[t:, k].any())
+    return template.source_visit == 0 and hidden and np.abs(state.chronology.world_from_template[t, k].xyz).max() == 0
+
+
+def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], streaks, observations, config: Config):
     """Templates of the removals, or more splats for those they were torn from; the ground under them filled."""
     background, errors = state.chronology.background, state.errors
     taken = np.zeros(background.count, bool)
@@ -84,6 +120,11 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], observatio
         taken |= removal.members
         if removal.support is not None:
             fills.append((np.asarray(piece.means, np.float64), removal.support))
+    for k, members in streaks.items():
+        members = members & ~taken
+        if members.any():
+            state = extend_template(state, k, background[members], errors[members])
+            taken |= members
     if not taken.any():
         return state, gone
     state = cut_background(state, taken)
@@ -105,12 +146,9 @@ def _torn_from(state: State, piece: Splats, among, t: int) -> int | None:
     belongs to."""
     means = np.asarray(piece.means)
     for k in among:
+        if not _stood_here(state, t, k):
+            continue
         template = state.chronology.templates[k]
-        if template.source_visit != 0 or bool(np.asarray(state.chronology.visible)[t:, k].any()):
-            continue
-        pose = state.chronology.world_from_template[t, k]
-        if np.abs(np.asarray(pose.xyz)).max() > 0:
-            continue
         size = template_diameter(template.splats)
         distance = cKDTree(np.asarray(template.splats.means)).query(means)[0]
         if np.median(distance) < 0.2 * size and template_diameter(piece) < 1.1 * size:
