@@ -253,11 +253,8 @@ def _fit_windows(
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
         return variables, losses
     progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first")
-    counts = fixed.owner.shape[0], fixed.ground.count
-    rows = [
-        tuple(_padded(part, most, count) for part, most, count in zip(pair, _most(rows), counts, strict=True))
-        for pair in rows
-    ]
+    counts, most = (fixed.owner.shape[0], fixed.ground.count), _most(rows)
+    rows = [tuple(map(_padded, pair, most, counts)) for pair in rows]
     # A window's visit is traced, so that one program serves all.
     windows = [eqx.tree_at(lambda w: (w.visit, w.rows), w, (jnp.asarray(w.visit), None)) for w in windows]
 
