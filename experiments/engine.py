@@ -186,7 +186,8 @@ def run_all(
                 tell(run, execute(run, out, retry=retry))
     else:
         # Fresh interpreters: JAX's threads do not survive a fork.
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        options = {"initializer": _share_programs, "initargs": (out.resolve() / "programs",)}
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), **options) as pool:
             under_way: dict[Future, Run] = {}
             while waiting or under_way:
                 while waiting and len(under_way) < workers and not late():
@@ -197,6 +198,13 @@ def run_all(
                 done = next(as_completed(under_way))
                 tell(under_way.pop(done), done.result())
     rebuild_table(out)
+
+
+def _share_programs(folder: Path) -> None:
+    """What one worker compiled, the others take from disk."""
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
 def _on_cluster(runs: list[Run], out: Path, address: str, retry: bool, tell: Callable[[Run, dict], None]) -> None:

@@ -57,6 +57,24 @@ def test_views_120_degrees_apart_find_each_box_once(count):
         assert instance.views == 3
 
 
+def test_two_boxes_that_a_streak_of_shadow_links_are_two():
+    streak = (np.array([0.0, 0.1, 0.01]), np.array([0.5, 0.015, 0.01]))
+    cones = [_cone(_camera(a), [*_BOXES, streak]) for a in (0.2, 2.3, 4.4)]
+    found = find_instances(cones, _table())
+    middles = [np.median(instance.points, axis=0)[:2] for instance in found]
+    for center, _ in _BOXES:
+        nearest = int(np.argmin([np.linalg.norm(m - center[:2]) for m in middles]))
+        assert np.linalg.norm(middles[nearest] - center[:2]) < 0.1
+        assert np.ptp(found[nearest].points[:, 0]) < 0.5  # not the other box too
+
+
+def test_a_mug_keeps_its_handle():
+    mug = (np.array([0.0, 0.0, 0.15]), np.array([0.12, 0.12, 0.15]))
+    handle = (np.array([0.17, 0.0, 0.15]), np.array([0.06, 0.02, 0.06]))
+    cones = [_cone(_camera(a), [mug, handle]) for a in (0.2, 2.3, 4.4)]
+    assert len(find_instances(cones, _table())) == 1
+
+
 def test_nothing_comes_where_another_photograph_sees_nothing():
     cones = [_cone(_camera(0.2), _BOXES[:1]), _cone(_camera(2.3), []), _cone(_camera(4.4), [])]
     assert find_instances(cones, _table()) == []

@@ -24,7 +24,7 @@ from ltgs_jax.template import (
 from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
-from ltgs_jax.template.removal import gone_evidence
+from ltgs_jax.template.removal import gone_evidence, taken_down
 
 
 def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
@@ -129,6 +129,20 @@ def test_what_one_photograph_sees_unchanged_did_not_leave():
     assert left[0] == 0 and stayed[0] > 0
     assert left[1] > 0 and left[2] > 0
     assert left[3] == 0 and stayed[3] == 0
+
+
+def test_a_burden_taken_down_parts_from_what_it_stood_on():
+    rng = np.random.default_rng(6)
+    height = np.concatenate([rng.uniform(0, 0.05, 200), rng.uniform(0.05, 0.2, 300)])
+    burden = height > 0.05
+    left, stayed = np.where(burden, 1.0, 0.0), np.where(burden, 0.0, 1.0)
+    part = taken_down(height, left, stayed, least=20)
+    assert part is not None
+    assert np.mean(part == burden) > 0.97
+    assert taken_down(height, np.ones(500), np.zeros(500), least=20) is None  # all of it left
+    patches = rng.uniform(size=500) < 0.5  # turned in place: some of it still has its colours
+    assert taken_down(height, np.where(patches, 1.0, 0), np.where(patches, 0, 1.0), least=20) is None
+    assert taken_down(height, left, stayed, least=250) is None
 
 
 def test_random_walk_reaches_the_side_without_evidence():

@@ -11,6 +11,10 @@ from scipy.spatial import cKDTree
 
 from .hull import Cone, carve
 
+_TOUCHING = np.ones((3, 3, 3), bool)
+_NECK = 0.4  # depth inside, over that of the deepest voxel, below which a body is cut
+_LEAST_CORE = 0.05  # volume of a core over that of the largest
+
 
 @dataclass(frozen=True)
 class MatchConfig:
@@ -128,14 +132,55 @@ def find_instances(
 
 
 def _clusters(points: Float[np.ndarray, "n 3"], spacing: float) -> list[Float[np.ndarray, "m 3"]]:
-    """Points grouped by voxels that touch; voxel edge 1/100 of their extent, and no finer than their spacing."""
+    """Points grouped by voxels that touch and are not linked by necks alone; voxel edge 1/100 of their extent, and no
+    finer than their spacing."""
     low = points.min(axis=0)
     voxel = max(np.ptp(points, axis=0).max() / 100, 1.2 * spacing) + 1e-9
-    index = np.floor((points - low) / voxel).astype(int)
-    solid = np.zeros(index.max(axis=0) + 1, bool)
+    index = np.floor((points - low) / voxel).astype(int) + 1
+    solid = np.zeros(index.max(axis=0) + 2, bool)
     solid[tuple(index.T)] = True
-    label = ndimage.label(solid, np.ones((3, 3, 3)))[0][tuple(index.T)]
-    return [points[label == i] for i in range(1, label.max() + 1)]
+    label = _bodies(solid)[tuple(index.T)]
+    return [points[label == i] for i in range(1, label.max() + 1) if (label == i).any()]
+
+
+def _bodies(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "x y z"]:
+    """Each solid body with a label from 1 on: what touches, cut where it is much thinner than elsewhere.
+
+    Shadows and remnants of what left link things that stand apart. A body is what lies around a core, the voxels at
+    least `_NECK` times as deep inside as the deepest, no farther from it than that one is deep; the rest is looked at
+    in the same way.
+    """
+    bodies = np.zeros(solid.shape, int)
+    filled = solid | ndimage.binary_closing(solid, _TOUCHING)
+    waiting = _pieces(filled)
+    while waiting:
+        box, piece = waiting.pop()
+        piece = np.pad(piece, 1)
+        depth = ndimage.distance_transform_edt(piece)
+        cores, count = ndimage.label(depth >= _NECK * depth.max(), _TOUCHING)
+        volumes = np.bincount(cores.ravel(), minlength=count + 1)
+        small = volumes < _LEAST_CORE * volumes[1:].max()
+        small[0] = True
+        distance, nearest = ndimage.distance_transform_edt(small[cores], return_indices=True)
+        near = piece & (distance <= depth.max())
+        owner = cores[tuple(nearest)]
+        here = bodies[box]
+        for core in np.flatnonzero(~small):
+            here[(near & (owner == core))[1:-1, 1:-1, 1:-1]] = bodies.max() + 1
+        rest = (piece & ~near)[1:-1, 1:-1, 1:-1]
+        waiting += [(_inside(box, part), mask) for part, mask in _pieces(rest)]
+    return bodies
+
+
+def _pieces(solid: Bool[np.ndarray, "x y z"]) -> list[tuple[tuple[slice, ...], Bool[np.ndarray, "a b c"]]]:
+    """The box of each connected piece, and the piece in it."""
+    label, _ = ndimage.label(solid, _TOUCHING)
+    return [(box, label[box] == i + 1) for i, box in enumerate(ndimage.find_objects(label))]
+
+
+def _inside(box: tuple[slice, ...], part: tuple[slice, ...]) -> tuple[slice, ...]:
+    """A box within a box, in the coordinates of all."""
+    return tuple(slice(b.start + p.start, b.start + p.stop) for b, p in zip(box, part, strict=True))
 
 
 def _outlines(cluster: Float[np.ndarray, "n 3"], cones: Sequence[Cone]) -> list[Bool[np.ndarray, "h w"]]:

@@ -51,12 +51,11 @@ class Arrival(eqx.Module):
 
 
 class NewObject(eqx.Module):
-    """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
-    in the windows, what is left unlike the photographs, and the share of the change that it explains."""
+    """A change as something never seen before: its splats after a short fit, those of them that are firm, what is left
+    unlike the photographs, and the share of the change that it explains."""
 
     template: Template
     firm: Bool[np.ndarray, " n"]
-    outlines: Bool[np.ndarray, "v s s"]
     error: float
     gain: float
 
@@ -94,23 +93,7 @@ def place_arrivals(
         crop = _crop_around(instance, observations, evidence, config)
         arrivals.append(Arrival(instance, support, crop, float(share)))
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
-    accounts, news = [], {}
-    tools = {"config": config, "rng": rng}
-    for (i, k), found in list(placements.items()):
-        if not _convincing(found, config):
-            continue
-        if i not in news:
-            news[i] = _as_new(state, t, arrivals[i], observations, evidence, **tools)
-        if news[i] is None or news[i].gain < config.template.tau_new:
-            continue
-        shape = _same_shape(found, news[i], arrivals[i].crop)
-        if found.gain * found.likeness * shape < config.template.tau_same:
-            identity = state.chronology.templates[k].identity
-            progress.note(
-                f"visit {t}: arrival {i} is not object {identity}: it explains {found.gain:.2f}, likeness "
-                f"{found.likeness:.2f}, their outlines overlap by {shape:.2f}"
-            )
-            del placements[i, k]
+    accounts = []
     pairs = _assigned(len(arrivals), placements, config)
     wrong = _unexplained(state, t, pairs, placements, observations, evidence, front_end, eye=eye, config=config)
     for i, k in pairs:
@@ -126,9 +109,8 @@ def place_arrivals(
             kind = "moved" if k in gone else "added"
             accounts.append(Account(k, kind, placement.gain, placement.error, arrival.instance.views))
         else:
-            if i not in news:
-                news[i] = _as_new(state, t, arrival, observations, evidence, **tools)
-            state, account = _add_new(state, t, arrival, news[i], config, progress)
+            new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
+            state, account = _add_new(state, t, arrival, new, config, progress)
             accounts += [account] if account is not None else []
     return state, accounts
 
@@ -172,10 +154,15 @@ def turn_in_place(
             template, support, support.moved(before), middle_of(points), crop,
             size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
         )  # fmt: skip
-        if search.best_gain < 0.5 * config.template.tau_gain:
+        if search.best_gain < config.template.tau_gain:
             continue
         found = settle_template(search, crop, size=size, refiner=eye.refiner)
         still = place_template(search, before, crop, size=size, refiner=eye.refiner)
+        progress.note(
+            f"visit {t}: object {template.identity} turned or nudged explains {found.gain:.2f}, outline "
+            f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness "
+            f"{found.error:.3f}; as it stood {still.error:.3f}"
+        )
         if not _convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
             continue
         pair, placed = [(0, k)], {(0, k): found}
@@ -228,11 +215,13 @@ def _unexplained(
     return wrong
 
 
+def _worth(found: Placement) -> float:
+    """Evidence for a known template: it explains the change, looks like the photographs, and leaves none of it out."""
+    return found.gain * found.likeness * found.recall if min(found.gain, found.likeness) > 0 else 0.0
+
+
 def _convincing(found: Placement, config: Config) -> bool:
-    options = config.template
-    return (
-        found.gain > options.tau_gain and found.overlap > options.tau_outline and found.likeness > options.tau_likeness
-    )
+    return found.overlap > config.template.tau_outline and _worth(found) > config.template.tau_same
 
 
 def _window(instance: Instance, observations) -> list[tuple[float, float, float]]:
@@ -298,24 +287,20 @@ def _placements(
                 config=config.template,
             )
         ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
-        for k in [k for k in ranked if searches[k].best_gain > 0.5 * config.template.tau_gain]:
+        for k in [k for k in ranked if searches[k].best_gain > config.template.tau_gain]:
             found = settle_template(searches[k], arrival.crop, size=sizes[k], refiner=eye.refiner)
             placements[i, k] = found
             identity = state.chronology.templates[k].identity
             progress.note(
                 f"visit {t}: arrival {i} as object {identity}: explains {found.gain:.2f}, "
-                f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}"
+                f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}"
             )
     return placements
 
 
 def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:
     """Each arrival with the template it is, or None for a new object: one assignment, best evidence in total."""
-    good = {
-        pair: found.gain * found.overlap * found.likeness
-        for pair, found in placements.items()
-        if _convincing(found, config)
-    }
+    good = {pair: _worth(found) for pair, found in placements.items() if _convincing(found, config)}
     known = sorted({k for _, k in good})
     cost = np.zeros((count, len(known) + count))
     for (i, k), worth in good.items():
@@ -343,16 +328,7 @@ def _as_new(
     if template is None:
         return None
     template, error, gain = _settle_new(template, arrival.crop, config)
-    firm, outlines = firm_part(template.splats, arrival.crop)
-    return NewObject(template, firm, outlines, error, gain)
-
-
-def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
-    """The least, over views, overlap (IoU) of a known template's outlines with those of the change as a new object."""
-    valid = np.asarray(crop.valid)
-    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
-    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
-    return float(np.min((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
+    return NewObject(template, firm_part(template.splats, arrival.crop), error, gain)
 
 
 def _add_new(

@@ -2,22 +2,50 @@
 
 from collections.abc import Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from ltgs_jax.fit import template_diameter
 from ltgs_jax.scene import Splats, Template, concatenate_splats
-from ltgs_jax.template import Removal, color_from_photographs, fill_under, find_removed, gone_evidence
+from ltgs_jax.template import (
+    Removal,
+    Support,
+    color_from_photographs,
+    fill_under,
+    find_removed,
+    gone_evidence,
+    share_of,
+    taken_down,
+)
 
 from .config import Config
 from .ground import ground_shade
 from .looks import Evidence, Eye, Observation, on_host, projection_of, vantage_of
-from .state import State, add_template, cut_background, extend_background, extend_template, next_identity, set_from
+from .state import (
+    State,
+    add_template,
+    cut_background,
+    extend_background,
+    extend_template,
+    next_identity,
+    set_from,
+    split_template,
+)
 
 _LEAST_SEEN = 0.3  # pixels (αT) from which on a splat is seen
 _CHANGED = 0.6  # share of them that changed, from which on it may be a streak of what left
 _CLOSE = 0.15  # distance from that, in its sizes
+
+
+class Remnant(eqx.Module):
+    """A smaller piece that changed beside what had left: more of that (`whole`, a template), or ground that something
+    else came to cover. Which, only what came can tell."""
+
+    splats: Splats
+    errors: Float[np.ndarray, " n"]
+    whole: int = eqx.field(static=True)
 
 
 def take_out(
@@ -31,12 +59,14 @@ def take_out(
     eye: Eye,
     config: Config,
     rng: np.random.Generator,
-) -> tuple[State, dict[int, float]]:
+) -> tuple[State, dict[int, float], list[Remnant]]:
     """Hide the templates and cut out the background objects that the photographs say have left.
 
     `gone`: what left before in this visit, by template: the share of its evidence that says so; returned with what is
-    new. A remnant of one of these joins it. `scene`: what `scene_at` gave for this state.
+    new, and with the remnants of what had left before, which are in no template and no background. `scene`: what
+    `scene_at` gave for this state.
     """
+    before = tuple(gone)
     splats, _, owner, _ = scene
     votes = [
         eye.votes(splats, o.camera, np.stack([o.valid, change.left * o.valid, change.mask * o.valid], axis=-1))
@@ -45,11 +75,16 @@ def take_out(
     seen, told = np.stack([v[:, 0] for v in votes]), np.stack([v[:, 1] for v in votes])
     pixels = int(np.mean([o.valid.size for o in observations]))
     gone = dict(gone)
+    least = config.template.min_pixels * pixels
     for k in range(len(state.chronology.templates)):
         left, stayed = gone_evidence(seen[:, owner == k + 1], told[:, owner == k + 1])
-        share = left.sum() / max(left.sum() + stayed.sum(), 1e-9)
-        if left.sum() > config.template.min_pixels * pixels and share > config.template.whole:
-            gone[k] = float(share)
+        if left.sum() > least and share_of(left, stayed) > config.template.whole:
+            upper = _taken_down(state, k, left, stayed, least, config)
+            if upper is not None:
+                part, level = upper
+                state = split_template(state, k, part, level)
+                left, stayed, k = left[part], stayed[part], len(state.chronology.templates) - 1
+            gone[k] = share_of(left, stayed)
             state = set_from(state, t, k, visible=False)
     base = owner == 0
     removals = find_removed(
@@ -62,7 +97,22 @@ def take_out(
         config=config.template,
     )
     streaks = _streaks(state, t, gone, seen[:, base].sum(axis=0), sum(v[base, 2] for v in votes))
-    return _cut_out(state, t, gone, removals, streaks, observations, config)
+    return _cut_out(state, t, gone, before, removals, streaks, observations, config)
+
+
+def _taken_down(
+    state: State, k: int, left: Float[np.ndarray, " m"], stayed: Float[np.ndarray, " m"], least: float, config: Config
+) -> tuple[Bool[np.ndarray, " m"], Support] | None:
+    """The part of a template that was taken down from upon the rest, and the level it stood on; None where it left as
+    a whole. What was carried together is one template until then."""
+    support = state.supports[k]
+    if support is None:
+        return None
+    height = support.height(np.asarray(state.chronology.templates[k].splats.means, np.float64))
+    part = taken_down(height, left, stayed, least=least, config=config.template)
+    if part is None:
+        return None
+    return part, Support(support.normal, support.offset + float(np.quantile(height[part], 0.02)), support.noise)
 
 
 def _streaks(
@@ -95,11 +145,12 @@ def _stood_here(state: State, t: int, k: int) -> bool:
     return template.source_visit == 0 and hidden and np.abs(state.chronology.world_from_template[t, k].xyz).max() == 0
 
 
-def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], streaks, observations, config: Config):
-    """Templates of the removals, or more splats for those they were torn from; the ground under them filled."""
+def _cut_out(state: State, t: int, gone, before, removals: Sequence[Removal], streaks, observations, config: Config):
+    """Templates of the removals, more splats for those they were torn from, or remnants of what had left `before`; the
+    ground under them filled."""
     background, errors = state.chronology.background, state.errors
     taken = np.zeros(background.count, bool)
-    fills = []
+    fills, remnants = [], []
     for removal in removals:
         piece = background[removal.members]
         k = _torn_from(state, piece, gone, t)
@@ -115,6 +166,8 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], streaks, o
             k = len(state.chronology.templates) - 1
             state = set_from(state, t, k, visible=False)
             gone[k] = removal.share
+        elif k in before:
+            remnants.append(Remnant(piece, errors[removal.members], k))
         else:
             state = extend_template(state, k, piece, errors[removal.members])
         taken |= removal.members
@@ -126,7 +179,7 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], streaks, o
             state = extend_template(state, k, background[members], errors[members])
             taken |= members
     if not taken.any():
-        return state, gone
+        return state, gone, remnants
     state = cut_background(state, taken)
     rest = state.chronology.background
     new = [on_host(fill_under(rest, points, support, config=config.template)) for points, support in fills]
@@ -138,7 +191,7 @@ def _cut_out(state: State, t: int, gone, removals: Sequence[Removal], streaks, o
         # Its colours are guesses: only a strong difference there says that something came.
         doubt = np.where(seen_there, 0.5, 1.0) * config.detect.guessed
         state = extend_background(state, on_host(ground), doubt, np.ones(ground.count, bool), t)
-    return state, gone
+    return state, gone, remnants
 
 
 def _torn_from(state: State, piece: Splats, among, t: int) -> int | None:

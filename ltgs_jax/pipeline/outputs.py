@@ -189,7 +189,7 @@ def _track(chronology: Chronology, k: int, accounts: Sequence[Sequence[Account]]
             event = "added"
         else:
             moved, turned = pose_change(chronology.world_from_template[t - 1, k], pose, size)
-            if account is not None and account.kind == "moved" and max(moved, turned) > _STILL:
+            if max(moved, turned) > _STILL:
                 event = "moved"
         quat = np.asarray(pose.quat, float)
         gain = account.gain if account is not None else None

@@ -118,6 +118,25 @@ def add_template(state: State, template: Template, errors: np.ndarray, support: 
     )
 
 
+def split_template(state: State, k: int, part: Bool[np.ndarray, " m"], support: Support) -> State:
+    """Template k without a part, which becomes one of its own, last, with the same poses and visits so far."""
+    chronology = state.chronology
+    whole, errors = chronology.templates[k], state.template_errors[k]
+    poses = jax.tree.map(
+        lambda leaf: np.concatenate([leaf, leaf[:, k : k + 1]], axis=1), chronology.world_from_template
+    )
+    rest = eqx.tree_at(lambda m: m.splats, whole, whole.splats[~part])
+    others = [rest if i == k else m for i, m in enumerate(chronology.templates)]
+    return _with_templates(
+        state,
+        (*others, Template(whole.splats[part], next_identity(state), whole.source_visit)),
+        poses,
+        np.concatenate([chronology.visible, np.asarray(chronology.visible)[:, k : k + 1]], axis=1),
+        (*[errors[~part] if i == k else e for i, e in enumerate(state.template_errors)], errors[part]),
+        (*state.supports, support),
+    )
+
+
 def drop_template(state: State, k: int) -> State:
     """The state without template k; those after it move up by one."""
     chronology = state.chronology

@@ -8,13 +8,25 @@ from jaxtyping import Bool, Float
 from ltgs_jax.detect import dilate, similarity
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.match import Instance, find_instances
+from ltgs_jax.scene import Template
 from ltgs_jax.template import unlikeness
 
 from .arrivals import place_arrivals, turn_in_place
 from .config import Config
-from .departures import take_out
+from .departures import Remnant, take_out
 from .looks import Evidence, Eye, Observation, compare, cone_of
-from .state import Account, State, doubt_template, drop_template, extend_background, scene_at, set_from
+from .state import (
+    Account,
+    State,
+    add_template,
+    doubt_template,
+    drop_template,
+    extend_background,
+    extend_template,
+    next_identity,
+    scene_at,
+    set_from,
+)
 
 _LEAST_SHOWN = 6  # times the least evidence for an object, dilated outlines included, below which nothing is seen of it
 
@@ -43,10 +55,12 @@ def explain_visit(
     if not any(mask.any() for mask in coarse):
         return state, [], coarse
     gone: dict[int, float] = {}
+    remnants: list[Remnant] = []
     # Twice: with the bulk of an object gone, what the first cut left of it stands out.
     for _ in range(2):
         background = state.chronology.background
-        state, gone = take_out(state, t, gone, scene, observations, evidence, eye=eye, config=config, rng=rng)
+        state, gone, torn = take_out(state, t, gone, scene, observations, evidence, eye=eye, config=config, rng=rng)
+        remnants += torn
         scene = scene_at(state, t)
         evidence = compare(eye, scene, observations, front_end, config)
         if state.chronology.background is background:
@@ -79,7 +93,7 @@ def explain_visit(
     )
     accounts += turned
     state, accounts = _put_back(
-        state, t, gone, accounts, known, observations, eye=eye, config=config, progress=progress
+        state, t, gone, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
     return _learn_errors(state, t, accounts, observations, front_end, eye, config), accounts, coarse
 
@@ -93,8 +107,8 @@ def _strength(instance: Instance, evidence: Evidence) -> float:
 
 
 def _put_back(
-    state: State, t: int, gone: dict[int, float], accounts: list[Account], known: int, observations, *, eye, config,
-    progress,
+    state: State, t: int, gone: dict[int, float], remnants: Sequence[Remnant], accounts: list[Account], known: int,
+    observations, *, eye, config, progress,
 ) -> tuple[State, list[Account]]:  # fmt: skip
     """What left stays after all where the photographs like the scene with it as well: still is cheaper than moved.
 
@@ -102,27 +116,42 @@ def _put_back(
     """
     final = {a.template: a for a in accounts}
     images = [eye.image(scene_at(state, t)[0], o.camera) for o in observations]
-    restored = []
-    for k in sorted(gone):
-        before = state.chronology.world_from_template[t - 1, k]
-        alternative = set_from(state, t, k, visible=True, pose=before)
-        splats = scene_at(alternative, t)[0]
-        others = [eye.image(splats, o.camera) for o in observations]
+
+    def judged(alternative: State):
+        others = [eye.image(scene_at(alternative, t)[0], o.camera) for o in observations]
         left, stayed, shown = _unlike_where_different(images, others, observations)
         # What hardly shows either way, under something that came, gives no account of itself.
         hidden = shown < _LEAST_SHOWN * config.template.min_pixels
-        if hidden or stayed <= left * (1 + config.template.still_margin):
+        return hidden or stayed <= left * (1 + config.template.still_margin), left, stayed, others
+
+    back = []
+    for k in sorted(gone):
+        alternative = set_from(state, t, k, visible=True, pose=state.chronology.world_from_template[t - 1, k])
+        stays, left, stayed, others = judged(alternative)
+        if stays:
             progress.note(
                 f"visit {t}: object {state.chronology.templates[k].identity} stays where it was "
                 f"(unlikeness {stayed:.3f} there, {left:.3f} without)"
             )
             state, images = alternative, others
             final.pop(k, None)
-            if k >= known:
-                restored.append(k)
+            back.append(k)
         elif k not in final:
             final[k] = Account(k, "removed", 1 - left / max(stayed, 1e-9), left, len(observations))
-    for k in reversed(restored):
+    for remnant in remnants:
+        alternative = extend_background(state, remnant.splats, remnant.errors, np.zeros(len(remnant.errors), bool), 0)
+        stays, left, stayed, others = judged(alternative)
+        if stays:
+            state, images = alternative, others
+        elif remnant.whole not in back:
+            state = extend_template(state, remnant.whole, remnant.splats, remnant.errors)
+        else:
+            support = state.supports[remnant.whole]
+            state = add_template(state, Template(remnant.splats, next_identity(state), 0), remnant.errors, support, 0)
+            k = len(state.chronology.templates) - 1
+            state = set_from(state, t, k, visible=False)
+            final[k] = Account(k, "removed", 1 - left / max(stayed, 1e-9), left, len(observations))
+    for k in reversed([k for k in back if k >= known and not state.chronology.world_from_template[t, k].xyz.any()]):
         template, errors = state.chronology.templates[k], state.template_errors[k]
         state = extend_background(drop_template(state, k), template.splats, errors, np.zeros(len(errors), bool), 0)
         final = {

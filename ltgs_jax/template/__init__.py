@@ -19,6 +19,8 @@ from .locate import unlikeness as unlikeness
 from .removal import Removal as Removal
 from .removal import find_removed as find_removed
 from .removal import gone_evidence as gone_evidence
+from .removal import share_of as share_of
+from .removal import taken_down as taken_down
 from .support import Support as Support
 from .support import Vantage as Vantage
 from .support import fit_support as fit_support

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 
 from ltgs_jax.geometry import C0, SE3, quat_from_rotmat
@@ -15,7 +15,7 @@ from ltgs_jax.scene import Splats, Template, pad_splats
 
 from .config import TemplateConfig
 from .consistency import surface_evidence
-from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of, turned_round
+from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of, recall_of, turned_round
 from .support import Support, Vantage, fit_support, rotation_about
 
 _TURNS = 12  # in place, of what was found
@@ -28,15 +28,15 @@ _AGREE = 0.06  # difference of colours at which two photographs hardly show one 
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
-    its outlines that nothing speaks against, its structural likeness to the photographs, its outlines in the windows.
-    """
+    its outlines that nothing speaks against, its structural likeness to the photographs, and the share of what changed
+    clearly that its outlines cover."""
 
     world_from_template: SE3
     error: float
     gain: float
     overlap: float
     likeness: float
-    outlines: Bool[np.ndarray, "v s s"]
+    recall: float
 
 
 def middle_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
@@ -236,7 +236,7 @@ def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refine
     error, gain = explained(images[0], crop)
     covered = cover[0] > 0.5
     overlap, alike = overlap_of(images[0], covered, crop), likeness(images[0], cover[0], crop)
-    return Placement(pose, error, gain, overlap, alike, covered)
+    return Placement(pose, error, gain, overlap, alike, recall_of(covered, crop))
 
 
 def _unlike(

@@ -41,14 +41,12 @@ class TemplateConfig:
     """Splats of a template while its pose is sought."""
     tau_search: float = 0.25
     """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
-    tau_gain: float = 0.25
-    """Share of the photometric error that a known template must explain to be taken for what came."""
-    tau_likeness: float = 0.4
-    """Structural likeness to the photographs, in the middle view, from which on a known template is what came."""
+    tau_gain: float = 0.06
+    """Share of the change that a known template must explain in the search, to be looked at closely."""
     tau_remains: float = 0.35
     """Share of the change that may still be seen where a known template is put, for it to be what came."""
-    tau_same: float = 0.11
-    """Share of the change explained, times structural likeness, times least overlap (IoU) over views with the outlines
-    of the change as a new object, from which on a known template is what came."""
+    tau_same: float = 0.04
+    """Share of the change explained, times structural likeness, times recall (the share of what changed clearly that
+    its outlines cover), from which on a known template is what came."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that nothing in the photographs speaks against."""

@@ -124,6 +124,7 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
 
 _FEW, _BATCH = 14, 64  # poses rendered in one call: of a descent (two with their probes), of a search
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
+_WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 
 
@@ -219,6 +220,16 @@ def overlap_of(images: Float[np.ndarray, "v s s 3"], covered: Bool[np.ndarray, "
     fits = region | (_unlike_crop(images[None], crop)[0] < backdrop_unlikeness(crop) + _AS_GOOD)
     used = covered & valid & region.any(axis=(1, 2), keepdims=True)
     return float(np.sum(used & fits) / max(np.sum(used), 1))
+
+
+def recall_of(covered: Bool[np.ndarray, "v s s"], crop: Crop) -> float:
+    """Share of the pixels of the region which nothing known explains that a template's outlines cover, or nearly, in
+    the middle of the views that have such pixels."""
+    wrong = np.asarray(crop.region & crop.valid) & (backdrop_unlikeness(crop) > _WRONG)
+    near = ndimage.binary_dilation(covered, np.ones((1, 3, 3), bool), iterations=2)
+    pixels = wrong.sum(axis=(1, 2))
+    shares = (wrong & near).sum(axis=(1, 2))[pixels > 8] / pixels[pixels > 8]
+    return float(np.median(shares)) if len(shares) else 0.0
 
 
 def _middle(template: Splats) -> SE3:

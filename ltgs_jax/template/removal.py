@@ -14,6 +14,7 @@ from .support import Support, Vantage, convex_footprint, fit_support
 
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
+_OFF = 0.7  # share of the evidence on what was taken down which must say that it left
 
 
 class Removal(eqx.Module):
@@ -38,6 +39,30 @@ def gone_evidence(
     mean = np.where(seen > _LEAST_VOTES, evidence / np.maximum(seen, 1e-9), 0)
     total = np.sum(np.minimum(seen, _MOST_VOTES) * np.where(mean < 0, 2 * mean, mean), axis=0)
     return np.maximum(total, 0), np.maximum(-total, 0)
+
+
+def share_of(left: Float[np.ndarray, " n"], stayed: Float[np.ndarray, " n"]) -> float:
+    """Share of the evidence that says that something left."""
+    return float(left.sum() / max(left.sum() + stayed.sum(), 1e-9))
+
+
+def taken_down(
+    height: Float[np.ndarray, " n"],
+    left: Float[np.ndarray, " n"],
+    stayed: Float[np.ndarray, " n"],
+    *,
+    least: float,
+    config: TemplateConfig = TemplateConfig(),
+) -> Bool[np.ndarray, " n"] | None:
+    """The splats, by their height above the support, of what was taken down from upon the rest; None where the evidence
+    does not part at a level, or either side has less than `least` pixels of it."""
+    levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
+    net = left - stayed
+    agreement = [net[height > level].sum() - net[height <= level].sum() for level in levels]
+    upper = height > levels[int(np.argmax(agreement))]
+    told = left[upper].sum() > least and stayed[~upper].sum() > least
+    parted = share_of(left[upper], stayed[upper]) > _OFF and share_of(left[~upper], stayed[~upper]) < config.whole
+    return upper if told and parted else None
 
 
 def find_removed(
@@ -74,7 +99,7 @@ def find_removed(
             views = int(np.sum(changed[:, members].sum(axis=1) >= least))
             # One photograph alone may only have something in front of it: it must show more, and solid ground below.
             if votes >= least and (views >= 2 or (views == 1 and support is not None and votes >= 3 * least)):
-                share = votes / (votes + float(stayed[members].sum()))
+                share = share_of(left[members], stayed[members])
                 removals.append(Removal(members, support, votes, share, views))
                 taken |= members
     return sorted(removals, key=lambda r: -r.votes)
@@ -123,7 +148,7 @@ def _parts(splats, colors, height, local, body, floor, axes, left, stayed, confi
     size = np.linalg.norm(np.ptp(means[body], axis=0))
     parts, rest = [], local
     for island in _islands(splats, height, local, floor, axes):
-        told = left[island].sum() / max((left + stayed)[island].sum(), 1e-9)
+        told = share_of(left[island], stayed[island])
         alone = np.linalg.norm(np.ptp(means[island], axis=0)) < 2 * size
         if told > config.whole and alone and left[island].sum() > 0.1 * left[body].sum():
             parts.append(island)
