@@ -133,16 +133,21 @@ def test_what_one_photograph_sees_unchanged_did_not_leave():
 
 def test_a_burden_taken_down_parts_from_what_it_stood_on():
     rng = np.random.default_rng(6)
-    height = np.concatenate([rng.uniform(0, 0.05, 200), rng.uniform(0.05, 0.2, 300)])
-    burden = height > 0.05
+    half = np.repeat([[0.15, 0.1, 0.025], [0.06, 0.06, 0.075]], [200, 300], axis=0)
+    points = rng.uniform(-1, 1, (500, 3)) * half + [0, 0, 1] * np.repeat([0.025, 0.125], [200, 300])[:, None]
+    burden = points[:, 2] > 0.05
     left, stayed = np.where(burden, 1.0, 0.0), np.where(burden, 0.0, 1.0)
-    part = taken_down(height, left, stayed, least=20)
+    part = taken_down(points, left, stayed, least=20)
     assert part is not None
-    assert np.mean(part == burden) > 0.97
-    assert taken_down(height, np.ones(500), np.zeros(500), least=20) is None  # all of it left
+    assert np.mean(part == burden) > 0.95
+    foot = burden & (points[:, 2] < 0.1)  # whose colours happen to agree
+    part = taken_down(points, np.where(foot, 0, left), np.where(foot, 1.0, stayed), least=20)
+    assert part is not None
+    assert np.mean(part == burden) > 0.95
+    assert taken_down(points, np.ones(500), np.zeros(500), least=20) is None  # all of it left
     patches = rng.uniform(size=500) < 0.5  # turned in place: some of it still has its colours
-    assert taken_down(height, np.where(patches, 1.0, 0), np.where(patches, 0, 1.0), least=20) is None
-    assert taken_down(height, left, stayed, least=250) is None
+    assert taken_down(points, np.where(patches, 1.0, 0), np.where(patches, 0, 1.0), least=20) is None
+    assert taken_down(points, left, stayed, least=250) is None
 
 
 def test_random_walk_reaches_the_side_without_evidence():

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
-from ltgs_jax.match import Instance
+from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.scene import Splats, Template, pad_splats, transform_splats
 from ltgs_jax.template import (
     Crop,
@@ -36,6 +36,7 @@ from .state import Account, State, add_template, extend_background, extend_templ
 
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
+_PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
@@ -81,6 +82,32 @@ def place_arrivals(
     `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground, or
     did show what left. `surface`: points of the known scene.
     """
+    tools = {"config": config, "rng": rng, "progress": progress}
+    arrivals = _arrivals_of(instances, t, observations, evidence, bared, surface, **tools)
+    state, accounts, known, rest = _place_known(state, t, gone, arrivals, eye=eye, **tools)
+    beside = _beside(state, t, known, observations, evidence, eye=eye, config=config)
+    if any(region.any() for region in beside):
+        after = compare(eye, scene_at(state, t), observations, front_end, config)
+        cones = [
+            cone_of(o.camera, dilate(r & m, config.detect.dilate) & o.valid, o.valid, look)
+            for o, r, m, look in zip(observations, beside, after.masks, after.looks, strict=True)
+        ]
+        found = [instance for instance in find_instances(cones, surface, config=config.match) if instance.views > 1]
+        more = _arrivals_of(found, t, observations, after, bared, surface, **tools)
+        state, added, _, others = _place_known(state, t, gone, more, eye=eye, **tools)
+        accounts, rest = accounts + added, rest + others
+    for arrival in rest:
+        new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
+        state, account = _add_new(state, t, arrival, new, config, progress)
+        accounts += [account] if account is not None else []
+    return state, accounts
+
+
+def _arrivals_of(
+    instances: Sequence[Instance], t: int, observations, evidence: Evidence, bared, surface, *, config: Config, rng,
+    progress,
+) -> list[Arrival]:  # fmt: skip
+    """Instances with what is below and around them; those above no surface are left out."""
     arrivals = []
     vantage = vantage_of(observations)
     for instance in instances:
@@ -92,27 +119,52 @@ def place_arrivals(
         share /= max(sum(r.sum() for r in instance.regions), 1)
         crop = _crop_around(instance, observations, evidence, config)
         arrivals.append(Arrival(instance, support, crop, float(share)))
+    return arrivals
+
+
+def _place_known(
+    state: State,
+    t: int,
+    gone: dict[int, float],
+    arrivals: Sequence[Arrival],
+    *,
+    eye: Eye,
+    config: Config,
+    rng,
+    progress,
+) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[Arrival]]:
+    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest."""
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
-    accounts = []
-    pairs = _assigned(len(arrivals), placements, config)
-    wrong = _unexplained(state, t, pairs, placements, observations, evidence, front_end, eye=eye, config=config)
-    for i, k in pairs:
-        if k in wrong:
-            identity = state.chronology.templates[k].identity
-            progress.note(f"visit {t}: arrival {i} is not object {identity}: {wrong[k]:.0%} of it still looks changed")
-            k = None
-        arrival = arrivals[i]
-        if k is not None:
-            placement = placements[i, k]
-            pose, doubt = placement.world_from_template, config.detect.moved
-            state = set_from(state, t, k, visible=True, pose=pose, unsure=doubt)
-            kind = "moved" if k in gone else "added"
-            accounts.append(Account(k, kind, placement.gain, placement.error, arrival.instance.views))
-        else:
-            new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
-            state, account = _add_new(state, t, arrival, new, config, progress)
-            accounts += [account] if account is not None else []
-    return state, accounts
+    accounts, known, rest = [], [], []
+    for i, k in _assigned(len(arrivals), placements, config):
+        if k is None:
+            rest.append(arrivals[i])
+            continue
+        found = placements[i, k]
+        state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
+        kind = "moved" if k in gone else "added"
+        accounts.append(Account(k, kind, found.gain, found.error, arrivals[i].instance.views))
+        known.append((arrivals[i], k))
+    return state, accounts, known, rest
+
+
+def _beside(
+    state: State, t: int, known: Sequence[tuple[Arrival, int]], observations, evidence: Evidence, *, eye: Eye,
+    config: Config,
+) -> list[Bool[np.ndarray, "h w"]]:  # fmt: skip
+    """The pixels within the outlines of arrivals that a known template explains only in part: of something else, taken
+    for one thing with it."""
+    scene = scene_at(state, t)
+    rest = [np.zeros_like(mask) for mask in evidence.masks]
+    for arrival, k in known:
+        cover = eye.cover(scene, [k], observations)
+        parts = [
+            region & mask & ~dilate(c, config.detect.dilate)
+            for region, mask, c in zip(arrival.instance.regions, evidence.masks, cover, strict=True)
+        ]
+        if sum(part.sum() > _PARTLY_KNOWN * max(c.sum(), 1) for part, c in zip(parts, cover, strict=True)) >= 2:
+            rest = [r | part for r, part in zip(rest, parts, strict=True)]
+    return rest
 
 
 def turn_in_place(
@@ -165,11 +217,10 @@ def turn_in_place(
         )
         if not _convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
             continue
-        pair, placed = [(0, k)], {(0, k): found}
-        if _unexplained(hidden, t, pair, placed, observations, without, front_end, eye=eye, config=config):
+        trial = set_from(hidden, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
+        if _still_changed(trial, t, k, observations, without, front_end, eye=eye, config=config):
             continue
-        doubt = config.detect.moved
-        state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=doubt)
+        state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
         progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
         accounts.append(Account(k, "moved", found.gain, found.error, views))
     return state, accounts
@@ -190,29 +241,19 @@ def _turned_candidates(state: State, t: int, gone: dict[int, float], observation
                 yield k
 
 
-def _unexplained(
-    state: State, t: int, pairs, placements, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
-) -> dict[int, float]:
-    """Templates that do not make the change go away where they would stand, with the share of it that remains.
+def _still_changed(
+    state: State, t: int, k: int, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
+) -> bool:
+    """Whether a template where it is does not make the change go away.
 
     The test is detection's own: what the template shows there, against what its splats are expected to leave.
     """
-    trial, doubt = state, config.detect.moved
-    known = [(i, k) for i, k in pairs if k is not None]
-    for i, k in known:
-        trial = set_from(trial, t, k, visible=True, pose=placements[i, k].world_from_template, unsure=doubt)
-    if not known:
-        return {}
-    scene = scene_at(trial, t)
+    scene = scene_at(state, t)
     after = compare(eye, scene, observations, front_end, config)
-    wrong = {}
-    for _, k in known:
-        cover = eye.cover(scene, [k], observations)
-        was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
-        now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
-        if now > config.template.tau_remains * max(was, 1):
-            wrong[k] = float(now / max(was, 1))
-    return wrong
+    cover = eye.cover(scene, [k], observations)
+    was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
+    now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
+    return bool(now > config.template.tau_remains * max(was, 1))
 
 
 def _worth(found: Placement) -> float:

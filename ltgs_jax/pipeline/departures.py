@@ -78,15 +78,20 @@ def take_out(
     least = config.template.min_pixels * pixels
     for k in range(len(state.chronology.templates)):
         left, stayed = gone_evidence(seen[:, owner == k + 1], told[:, owner == k + 1])
-        if left.sum() > least and share_of(left, stayed) > config.template.whole:
-            upper = _taken_down(state, k, left, stayed, least, config)
-            if upper is not None:
-                part, level = upper
-                state = split_template(state, k, part, level)
-                left, stayed, k = left[part], stayed[part], len(state.chronology.templates) - 1
+        if left.sum() < least:
+            continue
+        upper = _taken_down(state, k, left, stayed, least, config)
+        if upper is not None:
+            part, level = upper
+            state = split_template(state, k, part, level)
+            left, stayed, k = left[part], stayed[part], len(state.chronology.templates) - 1
+        if share_of(left, stayed) > config.template.whole:
             gone[k] = share_of(left, stayed)
             state = set_from(state, t, k, visible=False)
     base = owner == 0
+    # Ground that a later visit laid or brought to light is no object, whatever came to stand there.
+    laid = np.flatnonzero(base)[np.asarray(state.chronology.since) > 0]
+    told[:, laid] = np.minimum(told[:, laid], 0)
     removals = find_removed(
         splats[base],
         seen[:, base],
@@ -108,11 +113,11 @@ def _taken_down(
     support = state.supports[k]
     if support is None:
         return None
-    height = support.height(np.asarray(state.chronology.templates[k].splats.means, np.float64))
-    part = taken_down(height, left, stayed, least=least, config=config.template)
+    points = np.asarray(state.chronology.templates[k].splats.means, np.float64) @ support.frame().T
+    part = taken_down(points, left, stayed, least=least, config=config.template)
     if part is None:
         return None
-    return part, Support(support.normal, support.offset + float(np.quantile(height[part], 0.02)), support.noise)
+    return part, Support(support.normal, float(np.quantile(points[part, 2], 0.02)), support.noise)
 
 
 def _streaks(

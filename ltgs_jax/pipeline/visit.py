@@ -175,7 +175,8 @@ def _learn_errors(
         votes += eye.votes(splats, o.camera, np.stack([unlike * o.valid, o.valid], axis=-1))
     for account in placed:
         mine = votes[owner == account.template + 1]
-        learned = (mine[:, 0] + config.detect.guessed) / (mine[:, 1] + 1)
+        usual = mine[:, 0].sum() / max(mine[:, 1].sum(), 1e-9)
+        learned = (mine[:, 0] + usual) / (mine[:, 1] + 1)
         state = doubt_template(state, account.template, np.where(mine[:, 1] > 0.3, learned, 0.0))
     return state
 

@@ -15,6 +15,7 @@ from .support import Support, Vantage, convex_footprint, fit_support
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
+_STEP = 1.5  # growth of an outline from which on one thing stands upon another
 
 
 class Removal(eqx.Module):
@@ -47,22 +48,41 @@ def share_of(left: Float[np.ndarray, " n"], stayed: Float[np.ndarray, " n"]) -> 
 
 
 def taken_down(
-    height: Float[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 3"],
     left: Float[np.ndarray, " n"],
     stayed: Float[np.ndarray, " n"],
     *,
     least: float,
     config: TemplateConfig = TemplateConfig(),
 ) -> Bool[np.ndarray, " n"] | None:
-    """The splats, by their height above the support, of what was taken down from upon the rest; None where the evidence
-    does not part at a level, or either side has less than `least` pixels of it."""
+    """The splats of what was taken down from upon the rest; None where the evidence does not part at a level, or either
+    side has less than `least` pixels of it.
+
+    `points`: their centres along two axes of the support and its normal. The level is the one that parts the evidence
+    best, or below it the one at which the outline grows most: the foot of what was taken down tells little.
+    """
+    height = points[:, 2]
     levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
     net = left - stayed
-    agreement = [net[height > level].sum() - net[height <= level].sum() for level in levels]
-    upper = height > levels[int(np.argmax(agreement))]
+    best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
+    upper = height > levels[best]
     told = left[upper].sum() > least and stayed[~upper].sum() > least
     parted = share_of(left[upper], stayed[upper]) > _OFF and share_of(left[~upper], stayed[~upper]) < config.whole
-    return upper if told and parted else None
+    if not (told and parted):
+        return None
+    thick = 0.1 * np.ptp(height)
+    growth = [
+        _extent(points[(height > level - thick) & (height <= level)])
+        / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
+        for level in levels[: best + 1]
+    ]
+    step = int(np.argmax(growth))
+    return height > levels[step] if growth[step] > _STEP else upper
+
+
+def _extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Area of the box, along the first two axes, that holds the central 90 % of points."""
+    return float(np.prod(np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0))) if len(points) else 0.0
 
 
 def find_removed(
