@@ -55,11 +55,11 @@ def taken_down(
     least: float,
     config: TemplateConfig = TemplateConfig(),
 ) -> Bool[np.ndarray, " n"] | None:
-    """The splats of what was taken down from upon the rest; None where the evidence does not part at a level, or either
-    side has less than `least` pixels of it.
+    """The splats of what was taken down from upon the rest; None where the evidence does not part at a level, where the
+    outline does not step there, or where either side has less than `least` pixels of evidence.
 
-    `points`: their centres along two axes of the support and its normal. The level is the one that parts the evidence
-    best, or below it the one at which the outline grows most: the foot of what was taken down tells little.
+    `points`: their centres along two axes of the support and its normal. The level is the one, at or below that which
+    parts the evidence best, at which the outline grows most: the foot of what was taken down tells little.
     """
     height = points[:, 2]
     levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
@@ -77,7 +77,7 @@ def taken_down(
         for level in levels[: best + 1]
     ]
     step = int(np.argmax(growth))
-    return height > levels[step] if growth[step] > _STEP else upper
+    return height > levels[step] if growth[step] > _STEP else None
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
