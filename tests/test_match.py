@@ -68,6 +68,13 @@ def test_two_boxes_that_a_streak_of_shadow_links_are_two():
         assert np.ptp(found[nearest].points[:, 0]) < 0.5  # not the other box too
 
 
+def test_two_boxes_corner_to_corner_are_two():
+    corner = [(np.array([x, x, 0.13]), np.array([0.11, 0.11, 0.13])) for x in (-0.125, 0.125)]
+    cones = [_cone(_camera(a), corner) for a in (0.2, 2.3, 4.4)]
+    middles = sorted(float(np.median(instance.points, axis=0)[0]) for instance in find_instances(cones, _table()))
+    np.testing.assert_allclose(middles, [-0.125, 0.125], atol=0.05)
+
+
 def test_a_mug_keeps_its_handle():
     mug = (np.array([0.0, 0.0, 0.15]), np.array([0.12, 0.12, 0.15]))
     handle = (np.array([0.17, 0.0, 0.15]), np.array([0.06, 0.02, 0.06]))

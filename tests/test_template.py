@@ -107,11 +107,11 @@ def test_a_template_without_its_foot_keeps_its_height():
     seen = box[box[:, 2] > 0.4 * box[:, 2].max()]
     stood_on = Support(np.array([0, 0, 1.0]), 0.0, 1e-3)
     stands_on = Support(np.array([0, 0, 1.0]), 0.3, 1e-3)
-    poses = pose_hypotheses(seen, stood_on, stands_on, np.array([1.0, 2, 0]), turns=4, spread=0.5)
+    poses = pose_hypotheses(seen, stood_on, stands_on, np.array([[1.0, 2, 0]]), turns=4, spread=0.5)
     moved = np.asarray(poses.apply(jnp.asarray(seen, jnp.float32)))
     np.testing.assert_allclose(moved[..., 2], np.broadcast_to(seen[:, 2] + 0.3, moved.shape[:2]), atol=1e-5)
     lying = pose_hypotheses(
-        seen, stood_on, stands_on, np.array([1.0, 2, 0]), turns=4, spread=0.5, tilts=tilts_of(stood_on)
+        seen, stood_on, stands_on, np.array([[1.0, 2, 0]]), turns=4, spread=0.5, tilts=tilts_of(stood_on)
     )
     lowest = np.quantile(np.asarray(lying.apply(jnp.asarray(seen, jnp.float32)))[..., 2], 0.02, axis=1)
     np.testing.assert_allclose(lowest, 0.3, atol=1e-4)
@@ -245,7 +245,7 @@ def test_a_template_is_found_where_it_stands_now():
     turned = eqx.tree_at(lambda s: s.means, template.splats, truth.apply(template.splats.means))
     crop = _crop(turned, 40)
     config = TemplateConfig(search_splats=512)
-    place = np.array([0.1, 0.1, 0.15])
+    place = np.array([[0.1, 0.1, 0.15]])
     search = search_template(
         template, support, support, place, crop, size=0.42, refiner=Refiner(), rng=rng, config=config
     )

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 from .hull import Cone, carve
 
 _TOUCHING = np.ones((3, 3, 3), bool)
-_NECK = 0.4  # depth inside, over that of the deepest voxel, below which a body is cut
+_NECKS = (0.4, 0.5, 0.6, 0.7)  # depth inside, over that of the deepest voxel, at which a body may be cut
+_FINE = 5.0  # voxels; in bodies less deep, grid and noise would cut at the higher ones
 _LEAST_CORE = 0.05  # volume of a core over that of the largest
 
 
@@ -146,30 +147,43 @@ def _clusters(points: Float[np.ndarray, "n 3"], spacing: float) -> list[Float[np
 def _bodies(solid: Bool[np.ndarray, "x y z"]) -> Int[np.ndarray, "x y z"]:
     """Each solid body with a label from 1 on: what touches, cut where it is much thinner than elsewhere.
 
-    Shadows and remnants of what left link things that stand apart. A body is what lies around a core, the voxels at
-    least `_NECK` times as deep inside as the deepest, no farther from it than that one is deep; the rest is looked at
-    in the same way.
+    Shadows and remnants of what left link things that stand apart. A body is what lies around a core, no farther from
+    it than the deepest voxel is deep; the rest is looked at in the same way.
     """
     bodies = np.zeros(solid.shape, int)
-    filled = solid | ndimage.binary_closing(solid, _TOUCHING)
-    waiting = _pieces(filled)
+    waiting = _pieces(solid | ndimage.binary_closing(solid, _TOUCHING))
     while waiting:
         box, piece = waiting.pop()
         piece = np.pad(piece, 1)
         depth = ndimage.distance_transform_edt(piece)
-        cores, count = ndimage.label(depth >= _NECK * depth.max(), _TOUCHING)
-        volumes = np.bincount(cores.ravel(), minlength=count + 1)
-        small = volumes < _LEAST_CORE * volumes[1:].max()
-        small[0] = True
-        distance, nearest = ndimage.distance_transform_edt(small[cores], return_indices=True)
+        cores = _cores(depth)
+        distance, nearest = ndimage.distance_transform_edt(cores == 0, return_indices=True)
         near = piece & (distance <= depth.max())
         owner = cores[tuple(nearest)]
         here = bodies[box]
-        for core in np.flatnonzero(~small):
+        for core in range(1, cores.max() + 1):
             here[(near & (owner == core))[1:-1, 1:-1, 1:-1]] = bodies.max() + 1
         rest = (piece & ~near)[1:-1, 1:-1, 1:-1]
         waiting += [(_inside(box, part), mask) for part, mask in _pieces(rest)]
     return bodies
+
+
+def _cores(depth: Float[np.ndarray, "x y z"]) -> Int[np.ndarray, "x y z"]:
+    """The cores of a body by how deep inside each voxel is, numbered from 1: what hangs together at the least share of
+    the greatest depth at which there are several, each a third deeper at its deepest than where they part; else one."""
+    deepest = depth.max()
+    for level in _NECKS if deepest > _FINE else _NECKS[:1]:
+        label, count = ndimage.label(depth >= level * deepest, _TOUCHING)
+        index = np.arange(1, count + 1)
+        deep = ndimage.maximum(depth, label, index) >= 4 / 3 * level * deepest
+        volume = ndimage.sum(label > 0, label, index)
+        cores = index[deep & (volume >= _LEAST_CORE * volume.max())]
+        if len(cores) > 1:
+            number = np.zeros(count + 1, int)
+            number[cores] = np.arange(1, len(cores) + 1)
+            return number[label]
+    label, _ = ndimage.label(depth >= _NECKS[0] * deepest, _TOUCHING)
+    return (label == label.ravel()[depth.argmax()]).astype(int)
 
 
 def _pieces(solid: Bool[np.ndarray, "x y z"]) -> list[tuple[tuple[slice, ...], Bool[np.ndarray, "a b c"]]]:

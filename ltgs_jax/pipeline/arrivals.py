@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
@@ -37,6 +38,7 @@ from .state import Account, State, add_template, extend_background, extend_templ
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
+_ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
@@ -203,7 +205,7 @@ def turn_in_place(
         crop = _crop_around(Instance(points, tuple(regions), views), observations, without, config)
         size = template_diameter(template.splats)
         search = search_template(
-            template, support, support.moved(before), middle_of(points), crop,
+            template, support, support.moved(before), middle_of(points)[None], crop,
             size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
         )  # fmt: skip
         if search.best_gain < config.template.tau_gain:
@@ -319,7 +321,7 @@ def _placements(
                 state.chronology.templates[k],
                 stood_on,
                 arrival.support,
-                np.median(arrival.instance.points, axis=0),
+                _places(arrival.instance.points, sizes[k]),
                 arrival.crop,
                 size=sizes[k],
                 refiner=eye.refiner,
@@ -442,6 +444,17 @@ def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Templat
     if keep.sum() < 8:
         return template, error, 0.0
     return eqx.tree_at(lambda m: m.splats, template, splats[keep]), error, gain
+
+
+def _places(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "p 3"]:
+    """Where in an arrival's volume an object of this size may stand: in its middle, or, where there is room for more
+    than one such thing, in each part of it."""
+    middle = np.median(points, axis=0)[None]
+    low, high = np.quantile(points, [0.02, 0.98], axis=0)
+    if np.linalg.norm(high - low) < _ROOM * size:
+        return middle
+    parts, _ = kmeans2(points[:: max(1, len(points) // 2000)], 3, minit="++", seed=0)
+    return np.concatenate([middle, parts])
 
 
 def _sizes_agree(instance: Instance, size: float) -> bool:

@@ -61,37 +61,38 @@ def pose_hypotheses(
     template: Float[np.ndarray, "n 3"],
     stood_on: Support,
     stands_on: Support,
-    place: Float[np.ndarray, "3"],
+    places: Float[np.ndarray, "p 3"],
     *,
     turns: int,
     spread: float,
     tilts: Sequence[Float[np.ndarray, "3 3"]] = (np.eye(3),),
 ) -> SE3:
-    """Poses of a template (points in its frame, on `stood_on`) on another support around `place` (scene units).
+    """Poses of a template (points in its frame, on `stood_on`) on another support around `places` (scene units).
 
-    For each tilt and each of `turns` turns about the normal: the place itself and two rings of places around it, 0.35
-    and 0.8 `spread` wide. Upright, it keeps its height above what it stood on, of which the lowest points may say
-    little: no photograph shows them; tilted, the lowest points touch the support.
+    For each tilt and each of `turns` turns about the normal: each place itself and a ring around it, 0.35 `spread`
+    wide; around one that is alone, another of 0.8. Upright, it keeps its height above what it stood on, of which the
+    lowest points may say little: no photograph shows them; tilted, the lowest points touch the support.
     """
     center = middle_of(template)
     stood = stood_on.height(center[None])[0]
     align = rotation_between(stood_on.normal, stands_on.normal)
     axes = stands_on.frame()
     ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
-    offsets = [np.zeros(3), *[0.35 * spread * r for r in ring], *[0.8 * spread * r for r in ring]]
+    widths = (0.35, 0.8) if len(places) == 1 else (0.35,)
+    around = np.stack([np.zeros(3), *[width * spread * r for width in widths for r in ring]])
     matrices = []
     for tilt in tilts:
         for turn in range(turns):
             rotation = rotation_about(stands_on.normal, 2 * np.pi * turn / turns) @ align @ tilt
             upright = np.allclose(tilt, np.eye(3))
             lift = stood if upright else -np.quantile((template - center) @ rotation.T @ stands_on.normal, 0.02)
-            rest = place + (lift - stands_on.height(place[None])[0]) * stands_on.normal
-            for offset in offsets:
-                matrix = np.eye(4)
-                matrix[:3, :3] = rotation
-                matrix[:3, 3] = rest + offset - rotation @ center
+            for place in places:
+                rest = place + (lift - stands_on.height(place[None])[0]) * stands_on.normal
+                matrix = np.tile(np.eye(4), (len(around), 1, 1))
+                matrix[:, :3, :3] = rotation
+                matrix[:, :3, 3] = rest + around - rotation @ center
                 matrices.append(matrix)
-    return SE3.from_matrix(jnp.asarray(np.stack(matrices), jnp.float32))
+    return SE3.from_matrix(jnp.asarray(np.concatenate(matrices), jnp.float32))
 
 
 def tilts_of(support: Support) -> list[Float[np.ndarray, "3 3"]]:
@@ -139,7 +140,7 @@ def search_template(
     template: Template,
     stood_on: Support,
     stands_on: Support,
-    place: Float[np.ndarray, "3"],
+    places: Float[np.ndarray, "p 3"],
     crop: Crop,
     *,
     size: float,
@@ -160,7 +161,7 @@ def search_template(
     without, change = backdrop_error(coarse)
     best: Search | None = None
     for tilts, turns in (([np.eye(3)], config.yaw_steps), (tilts_of(stood_on), config.yaw_steps // 2)):
-        hypotheses = pose_hypotheses(points, stood_on, stands_on, place, turns=turns, spread=size, tilts=tilts)
+        hypotheses = pose_hypotheses(points, stood_on, stands_on, places, turns=turns, spread=size, tilts=tilts)
         if before is not None:
             hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
         scores = refiner.score(light, hypotheses, coarse, tolerance=0.1 * size)
