@@ -54,11 +54,12 @@ class Arrival(eqx.Module):
 
 
 class NewObject(eqx.Module):
-    """A change as something never seen before: its splats after a short fit, those of them that are firm, what is left
-    unlike the photographs, and the share of the change that it explains."""
+    """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
+    in the windows, what is left unlike the photographs, and the share of the change that it explains."""
 
     template: Template
     firm: Bool[np.ndarray, " n"]
+    outlines: Bool[np.ndarray, "v s s"]
     error: float
     gain: float
 
@@ -86,7 +87,7 @@ def place_arrivals(
     """
     tools = {"config": config, "rng": rng, "progress": progress}
     arrivals = _arrivals_of(instances, t, observations, evidence, bared, surface, **tools)
-    state, accounts, known, rest = _place_known(state, t, gone, arrivals, eye=eye, **tools)
+    state, accounts, known, rest = _place_known(state, t, gone, arrivals, observations, evidence, eye=eye, **tools)
     beside = _beside(state, t, known, observations, evidence, eye=eye, config=config)
     if any(region.any() for region in beside):
         after = compare(eye, scene_at(state, t), observations, front_end, config)
@@ -96,7 +97,7 @@ def place_arrivals(
         ]
         found = [instance for instance in find_instances(cones, surface, config=config.match) if instance.views > 1]
         more = _arrivals_of(found, t, observations, after, bared, surface, **tools)
-        state, added, _, others = _place_known(state, t, gone, more, eye=eye, **tools)
+        state, added, _, others = _place_known(state, t, gone, more, observations, after, eye=eye, **tools)
         accounts, rest = accounts + added, rest + others
     for arrival in rest:
         new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
@@ -129,6 +130,8 @@ def _place_known(
     t: int,
     gone: dict[int, float],
     arrivals: Sequence[Arrival],
+    observations: Sequence[Observation],
+    evidence: Evidence,
     *,
     eye: Eye,
     config: Config,
@@ -137,6 +140,17 @@ def _place_known(
 ) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[Arrival]]:
     """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest."""
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
+    as_new: dict[int, NewObject | None] = {}
+    for (i, k), found in list(placements.items()):
+        if not _convincing(found, config) or _worth(found) > config.template.tau_sure:
+            continue
+        if i not in as_new:
+            as_new[i] = _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
+        shape = 1.0 if as_new[i] is None else _same_shape(found, as_new[i], arrivals[i].crop)
+        if _worth(found) * shape < config.template.tau_shape:
+            identity = state.chronology.templates[k].identity
+            progress.note(f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f}")
+            del placements[i, k]
     accounts, known, rest = [], [], []
     for i, k in _assigned(len(arrivals), placements, config):
         if k is None:
@@ -371,7 +385,15 @@ def _as_new(
     if template is None:
         return None
     template, error, gain = _settle_new(template, arrival.crop, config)
-    return NewObject(template, firm_part(template.splats, arrival.crop), error, gain)
+    return NewObject(template, *firm_part(template.splats, arrival.crop), error, gain)
+
+
+def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
+    """The least, over views, overlap (IoU) of a known template's outlines with those of the change as a new object."""
+    valid = np.asarray(crop.valid)
+    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
+    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
+    return float(np.min((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
 
 
 def _add_new(

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 from ltgs_jax.geometry import C0, SE3, quat_from_rotmat
@@ -28,8 +28,8 @@ _AGREE = 0.06  # difference of colours at which two photographs hardly show one 
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
-    its outlines that nothing speaks against, its structural likeness to the photographs, and the share of what changed
-    clearly that its outlines cover."""
+    its outlines that nothing speaks against, its structural likeness to the photographs, the share of what changed
+    clearly that its outlines cover, and its outlines in the windows."""
 
     world_from_template: SE3
     error: float
@@ -37,6 +37,7 @@ class Placement(eqx.Module):
     overlap: float
     likeness: float
     recall: float
+    outlines: Bool[np.ndarray, "v s s"]
 
 
 def middle_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
@@ -237,7 +238,7 @@ def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refine
     error, gain = explained(images[0], crop)
     covered = cover[0] > 0.5
     overlap, alike = overlap_of(images[0], covered, crop), likeness(images[0], cover[0], crop)
-    return Placement(pose, error, gain, overlap, alike, recall_of(covered, crop))
+    return Placement(pose, error, gain, overlap, alike, recall_of(covered, crop), covered)
 
 
 def _unlike(

@@ -48,5 +48,9 @@ class TemplateConfig:
     tau_same: float = 0.04
     """Share of the change explained, times structural likeness, times recall (the share of what changed clearly that
     its outlines cover), from which on a known template is what came."""
+    tau_sure: float = 0.25
+    """The same product, from which on the outlines need not be compared."""
+    tau_shape: float = 0.08
+    """The same product times the least overlap (IoU), over views, with the outlines of the change as a new object."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that nothing in the photographs speaks against."""

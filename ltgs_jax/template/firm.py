@@ -15,8 +15,8 @@ from .locate import Crop, backdrop_unlikeness
 _FIRM = 0.65  # of the upper quartile of unlikeness: where Otsu's threshold fell on objects of several scenes
 
 
-def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
-    """The splats that are a new object.
+def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, "v s s"]]:
+    """The splats that are a new object, and its outlines in the windows.
 
     The others only mend the ground around it: shadows, what something had hidden.
     A splat is firm when every window that sees its place was clearly unlike the photograph without the object; the
@@ -29,7 +29,7 @@ def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
     least = np.where(seen, unlike[views, rows, columns], np.inf).min(axis=0)
     shown = (np.asarray(splats.opacities) > 0.1) & np.isfinite(least)
     if shown.sum() < 8:
-        return np.ones(len(means), bool)
+        return np.ones(len(means), bool), np.asarray(crop.region)
     firm = np.flatnonzero(shown & (least > _FIRM * np.quantile(least[shown], 0.75)))
     spacing = np.median(cKDTree(means[firm]).query(means[firm], k=min(4, len(firm)))[0][:, -1])
     largest = firm[components(means[firm], 3 * spacing) == 0]
@@ -39,7 +39,7 @@ def firm_part(splats: Splats, crop: Crop) -> Bool[np.ndarray, " n"]:
         outline[rows[view, inside], columns[view, inside]] = True
         outlines[view] = ndimage.binary_fill_holes(ndimage.binary_closing(np.pad(outline, 4), iterations=3))[4:-4, 4:-4]
     within = outlines[views, rows, columns] | ~seen
-    return within.all(axis=0) & seen.any(axis=0)
+    return within.all(axis=0) & seen.any(axis=0), outlines
 
 
 _project = jax.jit(jax.vmap(Camera.project, (0, None)))

@@ -159,12 +159,13 @@ def _window_mean(image: Float[Array, "*b h w"]) -> Float[Array, "*b h w"]:
 
 
 def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop) -> float:
-    """Mean structural agreement where the template shows, −1…1, in the middle of the views that show enough of it."""
+    """Mean structural agreement where the template shows, −1…1, in the middle of the views that show enough of it; −1
+    where one alone does of several that changed: that is no evidence for a place."""
     agreement = np.asarray(_structure(np.mean(images, axis=-1), np.mean(crop.target, axis=-1)))
     shown = (cover > 0.5) & np.asarray(crop.valid)
     pixels = shown.sum(axis=(1, 2))
     enough = pixels > max(0.2 * pixels.max(), 8)
-    if not enough.any():
+    if enough.sum() < min(2, max(1, np.asarray(crop.region).any(axis=(1, 2)).sum())):
         return -1.0
     means = np.sum(agreement * shown, axis=(1, 2))[enough] / pixels[enough]
     return float(np.median(means))
