@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
 from ltgs_jax.render import RenderPlan, render
-from ltgs_jax.scene import Chronology, Splats, compose, concatenate_splats, pad_splats, transform_splats
+from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats, pad_splats, transform_splats
 
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
@@ -185,9 +185,9 @@ def fit_chronology(
     removed, and the cost goes with the pixels that changed.
 
     Windows of the photographs hold what templates show, and ground that a later visit brought to light (`windows_of`);
-    background splats that show hardly outside of it may change, all others stay bit for bit. Windows of visit 0 are
-    replayed for the share `config.replay` of the steps. Returns the chronology and the loss of every step; a run whose
-    loss is not finite is stopped and the last finite state returned.
+    background splats close to an object, that show hardly outside of it, may change; all others stay bit for bit.
+    Windows of visit 0 are replayed for the share `config.replay` of the steps. Returns the chronology and the loss of
+    every step; a run whose loss is not finite is stopped and the last finite state returned.
 
     Raises ValueError without a photograph of a later visit.
     """
@@ -206,11 +206,12 @@ def fit_chronology(
         touched = came & (splats.logit_opacities > -np.inf)
         found, cast = windows_of([v.view for v in views if v.visit == visit], visit, splats, touched, side=side)
         windows, votes = windows + found, votes + cast
-    may_change = (owner > 0) | within_change(votes)
-    free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
     every = jax.tree.map(np.array, concatenate_splats([background, *(m.splats for m in templates)]))
     placements = placements_of(chronology)
     diameters = np.asarray([template_diameter(m.splats) for m in templates], np.float32)
+    near = came | _close_to_objects(every, templates, placements, diameters)
+    may_change = (owner > 0) | (near & within_change(votes))
+    free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
     fixed = _Fixed(
         jax.device_put(pad_splats(every[held], 1)),
         jnp.asarray(owner[free]),
@@ -231,6 +232,19 @@ def fit_chronology(
         lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template), chronology, (*parts, poses)
     )
     return jax.tree.map(jnp.asarray, fitted), losses
+
+
+def _close_to_objects(
+    splats: Splats, templates: Sequence[Template], placements: Placements, diameters: Float[np.ndarray, " k"]
+) -> Bool[np.ndarray, " n"]:
+    """Splats that lie whole within a sphere of twice an object's size around a place where it stood: what floats
+    before the cameras would take on what a window shows, and veil other views with it."""
+    close = np.zeros(splats.count, bool)
+    reach = 2 * np.exp(splats.log_scales.max(axis=-1))
+    for k, pose in zip(np.asarray(placements.template), placements.poses.as_matrix(), strict=True):
+        middle = np.asarray(pose)[:3] @ np.append(np.median(templates[k].splats.means, axis=0), 1)
+        close |= np.linalg.norm(splats.means - middle, axis=-1) + reach < diameters[k]
+    return close
 
 
 def _rows_among(rows: Int[np.ndarray, " m"], chosen: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:

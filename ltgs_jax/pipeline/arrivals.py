@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
+from ltgs_jax.geometry import SE3, rotation_angle
 from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.scene import Splats, Template, pad_splats, transform_splats
 from ltgs_jax.template import (
@@ -38,6 +39,7 @@ from .state import Account, State, add_template, extend_background, extend_templ
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
+_TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
@@ -147,7 +149,7 @@ def _place_known(
         if i not in as_new:
             as_new[i] = _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
         shape = 1.0 if as_new[i] is None else _same_shape(found, as_new[i], arrivals[i].crop)
-        if _worth(found) * shape < config.template.tau_shape:
+        if shape < config.template.tau_shape:
             identity = state.chronology.templates[k].identity
             progress.note(f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f}")
             del placements[i, k]
@@ -233,6 +235,8 @@ def turn_in_place(
         )
         if not _convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
             continue
+        if not _elsewhere(found.world_from_template, before, template, size):
+            continue
         trial = set_from(hidden, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
         if _still_changed(trial, t, k, observations, without, front_end, eye=eye, config=config):
             continue
@@ -255,6 +259,14 @@ def _turned_candidates(state: State, t: int, gone: dict[int, float], observation
             changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
             if sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2:
                 yield k
+
+
+def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool:
+    """Whether two poses of a template differ by more than poses are known."""
+    middle = jnp.asarray(middle_of(np.asarray(template.splats.means)), jnp.float32)
+    turn = float(rotation_angle((before.inverse() @ after).quat))
+    shift = np.linalg.norm(np.asarray(after.apply(middle[None]) - before.apply(middle[None])))
+    return bool(turn > _TURNED or shift > _SHIFTED * size)
 
 
 def _still_changed(

@@ -41,16 +41,16 @@ class TemplateConfig:
     """Splats of a template while its pose is sought."""
     tau_search: float = 0.25
     """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
-    tau_gain: float = 0.06
+    tau_gain: float = 0.02
     """Share of the change that a known template must explain in the search, to be looked at closely."""
     tau_remains: float = 0.35
     """Share of the change that may still be seen where a known template is put, for it to be what came."""
     tau_same: float = 0.04
     """Share of the change explained, times structural likeness, times recall (the share of what changed clearly that
     its outlines cover), from which on a known template is what came."""
-    tau_sure: float = 0.25
+    tau_sure: float = 0.2
     """The same product, from which on the outlines need not be compared."""
-    tau_shape: float = 0.08
-    """The same product times the least overlap (IoU), over views, with the outlines of the change as a new object."""
+    tau_shape: float = 0.55
+    """Least overlap (IoU), over views, of a known template's outlines with those of the change as a new object."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that nothing in the photographs speaks against."""
