@@ -32,7 +32,8 @@ class LongConfig:
     dssim: float = 0.2
     """λ, the weight of 1 − SSIM in the loss."""
     background_rate: float = 1.0
-    """Factor on the rates of the background's splats that the first visit showed; 0: they stay as they are."""
+    """Factor on the rate of the colours of the background's splats that the first visit showed, close to an object;
+    where these are, how large and how opaque, stays. 0: the colours stay too."""
     translation_rate: float = 1e-3
     """Step of a pose's translation, in units of the object's diameter."""
     rotation_rate: float = 1e-3
@@ -98,12 +99,13 @@ class _Variables(eqx.Module):
 
 
 class _Fixed(eqx.Module):
-    """What stays: the ground's other splats; whose the variable ones are (0 the ground's, 1 + k template k's) and the
-    factor on their rates; poses, the diameter of each pose's object, and the scene's extent."""
+    """What stays: the ground's other splats; whose the variable ones are (0 the ground's, 1 + k template k's) and
+    whether they belong to a template or came after the first visit; poses, the diameter of each pose's object, and the
+    scene's extent."""
 
     ground: Splats
     owner: Int[Array, " n"]
-    rate: Float[Array, " n"]
+    came: Bool[Array, " n"]
     placements: Placements
     diameters: Float[Array, " p"]
     extent: Float[Array, ""]
@@ -139,7 +141,7 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     def put(tree, part):
         return jax.tree.map(lambda leaf, new: leaf.at[rows].set(new, mode="drop"), tree, part)
 
-    owner, rate = taken((fixed.owner, fixed.rate))
+    owner, came = taken((fixed.owner, fixed.came))
 
     def objective(local: _Variables):
         splats = _window_splats(local.splats, local.tangents, rows, ground_rows, window.visit, fixed)
@@ -155,7 +157,9 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     before = state._replace(mu=_with_rows(state.mu, taken), nu=_with_rows(state.nu, taken))
     updates, after = adam().update(gradient, before)
     moves = scale_gradients(updates.splats, config.rates, fixed.extent, progress)
-    moves = jax.tree.map(lambda leaf: leaf * rate.reshape((-1,) + (1,) * (leaf.ndim - 1)), moves)
+    colours = jnp.where(came, 1, config.background_rate)[:, None, None] * moves.sh
+    moves = jax.tree.map(lambda leaf: jnp.where(came.reshape((-1,) + (1,) * (leaf.ndim - 1)), leaf, 0), moves)
+    moves = eqx.tree_at(lambda m: m.sh, moves, colours)
     # A pose of an object that this window does not show has no gradient, and Adam's momentum must not carry it on.
     seen = jnp.any(gradient.tangents != 0, axis=-1)
     free = (seen & ~fixed.placements.fixed & config.fit_poses)[:, None]
@@ -215,7 +219,7 @@ def fit_chronology(
     fixed = _Fixed(
         jax.device_put(pad_splats(every[held], 1)),
         jnp.asarray(owner[free]),
-        jnp.asarray(np.where(came, 1.0, config.background_rate)[free], jnp.float32),
+        jnp.asarray(came[free]),
         placements,
         jnp.asarray(diameters[np.asarray(placements.template)]),
         jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32),
