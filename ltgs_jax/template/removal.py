@@ -15,6 +15,7 @@ from .support import Support, Vantage, convex_footprint, fit_support
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
+_LEVELS = np.linspace(0.1, 0.9, 17)  # quantiles of height at which one thing may end upon another
 _STEP = 1.5  # growth of an outline from which on one thing stands upon another
 
 
@@ -62,19 +63,25 @@ def taken_down(
     parts the evidence best, at which the outline grows most: the foot of what was taken down tells little.
     """
     height = points[:, 2]
-    levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
+    levels = np.quantile(height, _LEVELS)
     net = left - stayed
     best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
     upper = height > levels[best]
     told = left[upper].sum() > least and stayed[~upper].sum() > least
     parted = share_of(left[upper], stayed[upper]) > _OFF and share_of(left[~upper], stayed[~upper]) < config.whole
-    if not (told and parted):
-        return None
+    return stands_upon(points, levels[best]) if told and parted else None
+
+
+def stands_upon(points: Float[np.ndarray, "n 3"], highest: float = np.inf) -> Bool[np.ndarray, " n"] | None:
+    """The splats of one thing that stands upon another: those above the level, up to `highest`, at which the outline
+    grows most, downwards; None where it does not step. `points` as `taken_down` takes them."""
+    height = points[:, 2]
+    levels = np.quantile(height, _LEVELS)
     thick = 0.1 * np.ptp(height)
     growth = [
         _extent(points[(height > level - thick) & (height <= level)])
         / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
-        for level in levels[: best + 1]
+        for level in levels[levels <= highest]
     ]
     step = int(np.argmax(growth))
     return height > levels[step] if growth[step] > _STEP else None
@@ -158,11 +165,14 @@ def _within_outline(means, body, queries, axes) -> Bool[np.ndarray, " q"]:
     return convex_footprint((flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0), means[queries] @ axes.T)
 
 
-def _parts(splats, colors, height, local, body, floor, axes, left, stayed, config: TemplateConfig) -> list[np.ndarray]:
+def _parts(
+    splats, colors, height, local, body, floor, axes, left, stayed, config: TemplateConfig, *, apart: bool
+) -> list[np.ndarray]:
     """What of the `local` splats above a support left, one array of indices for each solid thing.
 
     A thing that stands apart goes as a whole once a good part of it is seen to have changed: turned or shifted a
-    little, it still has its own colours in many places. What touches its neighbours is cut from them by a random walk.
+    little, it still has its own colours in many places. What touches its neighbours is cut from them by a random walk,
+    unless only what stands `apart` is asked for.
     """
     means = np.asarray(splats.means, np.float64)
     size = np.linalg.norm(np.ptp(means[body], axis=0))
@@ -173,12 +183,19 @@ def _parts(splats, colors, height, local, body, floor, axes, left, stayed, confi
         if told > config.whole and alone and left[island].sum() > 0.1 * left[body].sum():
             parts.append(island)
             rest = np.setdiff1d(rest, island)
-    if len(np.intersect1d(rest, body)) >= 8:
+    if not apart and len(np.intersect1d(rest, body)) >= 8:
         graph = neighbour_graph(means[rest], colors[rest], color_scale=config.cut_color)
         # Capped, so that a splat that straddles the outline goes with its neighbours.
         probability = random_walk(graph, np.minimum(left[rest], 2), np.minimum(stayed[rest], 2))
         parts += _groups(means, rest[probability > 0.5])
     return [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+
+
+def _above(members: Int[np.ndarray, " m"], height, noise: float, config: TemplateConfig):
+    """How high above a support members reach, the height up to which they are that itself, and those above it."""
+    top = np.quantile(height[members], 0.95) if len(members) else 0.0
+    floor = max(config.flat * noise, 0.05 * top)
+    return top, floor, members[height[members] > floor]
 
 
 def _solids(splats: Splats, colors, group, left, stayed, vantage, rng, config: TemplateConfig):
@@ -194,13 +211,17 @@ def _solids(splats: Splats, colors, group, left, stayed, vantage, rng, config: T
         members[group] = True
         return [(members, None)]
     height, axes = support.height(means), support.frame()[:2]
-    top = np.quantile(height[group], 0.95)
-    floor = max(config.flat * support.noise, 0.05 * top)
-    body = group[height[group] > floor]
-    if len(body) < 8 or top < floor * 1.5 or left[body].sum() < 0.2 * left[group].sum():
+    top, floor, body = _above(group, height, support.noise, config)
+    if top < floor * 1.5:
+        return []
+    # Ground that something new came to stand upon hangs together with a thing beside it, which must then stand apart.
+    ground_alone = left[body].sum() < 0.2 * left[group].sum()
+    if ground_alone:
+        top, floor, body = _above(body, height, support.noise, config)
+    if len(body) < 8:
         return []
     local = np.flatnonzero(near & (height > floor))
-    parts = _parts(splats, colors, height, local, body, floor, axes, left, stayed, config)
+    parts = _parts(splats, colors, height, local, body, floor, axes, left, stayed, config, apart=ground_alone)
     # What is under the body goes with it, its contact with the support included: the fill replaces that. So do splats
     # within its outline that nothing says stayed.
     free = near & (height > -floor) & (height < 1.1 * top) & (stayed <= left)
