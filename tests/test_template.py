@@ -24,7 +24,7 @@ from ltgs_jax.template import (
 from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
-from ltgs_jax.template.removal import gone_evidence, taken_down
+from ltgs_jax.template.removal import gone_evidence, stands_upon, taken_down
 
 
 def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
@@ -150,6 +150,16 @@ def test_a_burden_taken_down_parts_from_what_it_stood_on():
     assert taken_down(points, left, stayed, least=250) is None
 
 
+def test_one_thing_upon_another_is_told_by_the_step_of_its_outline():
+    rng = np.random.default_rng(7)
+    half = np.repeat([[0.15, 0.1, 0.025], [0.06, 0.06, 0.075]], [200, 300], axis=0)
+    points = rng.uniform(-1, 1, (500, 3)) * half + [0, 0, 1] * np.repeat([0.025, 0.125], [200, 300])[:, None]
+    part = stands_upon(points)
+    assert part is not None
+    assert np.mean(part == (points[:, 2] > 0.05)) > 0.95
+    assert stands_upon(_box(rng)[0]) is None  # one box
+
+
 def test_random_walk_reaches_the_side_without_evidence():
     rng = np.random.default_rng(1)
     table, (box, colors) = _table(rng), _box(rng)
@@ -192,6 +202,22 @@ def test_a_box_that_turned_in_place_goes_as_a_whole():
     assert len(found) == 1
     assert found[0].members[on_box].mean() > 0.9
     assert found[0].share < 0.7
+
+
+def test_a_box_that_turned_beside_covered_ground_goes_and_the_ground_stays():
+    rng = np.random.default_rng(13)
+    table, (box, colors) = _table(rng, 4000), _box(rng)
+    means = np.concatenate([table, box])
+    splats = _splats(means, np.concatenate([np.full((len(table), 3), 0.5), colors]), 0.02)
+    on_box = np.arange(len(means)) >= len(table)
+    covered = ~on_box & (np.abs(means[:, 0] - 0.35) < 0.3) & (np.abs(means[:, 1]) < 0.3)  # up to the box
+    looks_the_same = on_box & (means[:, 0] > 0.02)
+    seen = np.where(covered, 12.0, 4.0) * np.ones((3, 1))
+    evidence = np.where((on_box & ~looks_the_same) | covered, seen, -4.0)
+    found = find_removed(splats, seen, evidence, _CAMERAS, pixels=100_000, rng=rng)
+    assert len(found) == 1
+    assert found[0].members[on_box].mean() > 0.9
+    assert found[0].members[covered & (means[:, 0] > 0.2)].sum() == 0
 
 
 def test_nothing_changed_nothing_removed():

@@ -78,18 +78,18 @@ def stands_upon(points: Float[np.ndarray, "n 3"], highest: float = np.inf) -> Bo
     height = points[:, 2]
     levels = np.quantile(height, _LEVELS)
     thick = 0.1 * np.ptp(height)
-    growth = [
-        _extent(points[(height > level - thick) & (height <= level)])
-        / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
-        for level in levels[levels <= highest]
-    ]
+    below, above = (
+        [_extent(points[(height > level - down) & (height <= level + up)]) for level in levels[levels <= highest]]
+        for down, up in ((thick, 0), (0, thick))
+    )
+    growth = [b / a if a > 0 else 0.0 for b, a in zip(below, above, strict=True)]
     step = int(np.argmax(growth))
     return height > levels[step] if growth[step] > _STEP else None
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
-    """Area of the box, along the first two axes, that holds the central 90 % of points."""
-    return float(np.prod(np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0))) if len(points) else 0.0
+    """Area of the box, along the first two axes, that holds the central 90 % of points; 0 where there are too few."""
+    return float(np.prod(np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0))) if len(points) >= 8 else 0.0
 
 
 def find_removed(
