@@ -43,7 +43,7 @@ _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pi
 _TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
-_SHOWN = 0.5  # share of a change in which a new object must show: what lies in and under what was known is no object
+_SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -109,9 +109,9 @@ def place_arrivals(
     for arrival in rest:
         new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
         after, account = _add_new(state, t, arrival, new, config, progress)
-        shown = 1.0 if account is None else _shown(after, t, account.template, arrival, observations, eye=eye)
+        shown = 1.0 if account is None else _shown(after, t, account.template, observations, eye=eye)
         if shown < _SHOWN:
-            progress.note(f"visit {t}: a change left out, as a new object it shows in {shown:.2f} of it")
+            progress.note(f"visit {t}: a change left out, as a new object {shown:.2f} of it shows")
             continue
         state, accounts = after, accounts + ([account] if account is not None else [])
     return state, gone, accounts
@@ -481,11 +481,14 @@ def _add_new(
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
 
 
-def _shown(state: State, t: int, k: int, arrival: Arrival, observations, *, eye: Eye) -> float:
-    """Share of an arrival's outlines in which the scene shows a template, in the middle of the views that have any."""
-    cover = eye.cover(scene_at(state, t), [k], observations)
-    outlines = arrival.instance.regions
-    shares = [(c & r).sum() / r.sum() for c, r in zip(cover, outlines, strict=True) if r.any()]
+def _shown(state: State, t: int, k: int, observations, *, eye: Eye) -> float:
+    """Share of the pixels which a template shows in alone that show it in the scene, in the middle of the views."""
+    scene = scene_at(state, t)
+    splats, errors, owner, _ = scene
+    mine = owner == k + 1
+    alone = [eye.look(splats[mine], o.camera, errors[mine]).alpha > 0.5 for o in observations]
+    cover = eye.cover(scene, [k], observations)
+    shares = [(c & a).sum() / a.sum() for c, a in zip(cover, alone, strict=True) if a.any()]
     return float(np.median(shares)) if shares else 0.0
 
 
