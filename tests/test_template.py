@@ -24,7 +24,7 @@ from ltgs_jax.template import (
 from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
-from ltgs_jax.template.removal import gone_evidence, stands_upon, taken_down
+from ltgs_jax.template.removal import gone_evidence, taken_down
 
 
 def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
@@ -148,16 +148,6 @@ def test_a_burden_taken_down_parts_from_what_it_stood_on():
     patches = rng.uniform(size=500) < 0.5  # turned in place: some of it still has its colours
     assert taken_down(points, np.where(patches, 1.0, 0), np.where(patches, 0, 1.0), least=20) is None
     assert taken_down(points, left, stayed, least=250) is None
-
-
-def test_one_thing_upon_another_is_told_by_the_step_of_its_outline():
-    rng = np.random.default_rng(7)
-    half = np.repeat([[0.15, 0.1, 0.025], [0.06, 0.06, 0.075]], [200, 300], axis=0)
-    points = rng.uniform(-1, 1, (500, 3)) * half + [0, 0, 1] * np.repeat([0.025, 0.125], [200, 300])[:, None]
-    part = stands_upon(points)
-    assert part is not None
-    assert np.mean(part == (points[:, 2] > 0.05)) > 0.95
-    assert stands_upon(_box(rng)[0]) is None  # one box
 
 
 def test_random_walk_reaches_the_side_without_evidence():

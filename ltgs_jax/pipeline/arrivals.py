@@ -32,7 +32,6 @@ from ltgs_jax.template import (
 )
 
 from .config import Config
-from .departures import part_burden
 from .ground import ground_shade
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
@@ -83,18 +82,15 @@ def place_arrivals(
     config: Config,
     rng: np.random.Generator,
     progress,
-) -> tuple[State, dict[int, float], list[Account]]:
+) -> tuple[State, list[Account]]:
     """Known templates for what came, by photometric evidence and one assignment; new objects for the rest.
 
-    `gone`: templates that left their place in this visit, returned with those that parted from one of them. `bared`:
-    the pixels that show guessed ground, or did show what left. `surface`: points of the known scene.
+    `gone`: templates that left their place in this visit. `bared`: the pixels that show guessed ground, or
+    did show what left. `surface`: points of the known scene.
     """
     tools = {"config": config, "rng": rng, "progress": progress}
     arrivals = _arrivals_of(instances, t, observations, evidence, bared, surface, **tools)
     state, accounts, known, rest = _place_known(state, t, gone, arrivals, observations, evidence, eye=eye, **tools)
-    parted = _place_parted(state, t, gone, rest, observations, evidence, eye=eye, **tools)
-    state, gone, rest = parted[0], parted[1], parted[4]
-    accounts, known = accounts + parted[2], known + parted[3]
     beside = _beside(state, t, known, observations, evidence, eye=eye, config=config)
     if any(region.any() for region in beside):
         after = compare(eye, scene_at(state, t), observations, front_end, config)
@@ -114,7 +110,7 @@ def place_arrivals(
             progress.note(f"visit {t}: a change left out, as a new object {shown:.2f} of it shows")
             continue
         state, accounts = after, accounts + ([account] if account is not None else [])
-    return state, gone, accounts
+    return state, accounts
 
 
 def _arrivals_of(
@@ -144,17 +140,13 @@ def _place_known(
     observations: Sequence[Observation],
     evidence: Evidence,
     *,
-    among: Sequence[int] | None = None,
     eye: Eye,
     config: Config,
     rng,
     progress,
 ) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[Arrival]]:
-    """Hidden templates (all, or those `among`) where they explain an arrival: the state, an account of each, which is
-    which, and the rest."""
-    hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
-    hidden = [k for k in hidden if among is None or k in among]
-    placements = _placements(state, t, hidden, arrivals, eye=eye, config=config, rng=rng, progress=progress)
+    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest."""
+    placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
     as_new: dict[int, NewObject | None] = {}
     for (i, k), found in list(placements.items()):
         if not _convincing(found, config) or _worth(found) > config.template.tau_sure:
@@ -177,30 +169,6 @@ def _place_known(
         accounts.append(Account(k, kind, found.gain, found.error, arrivals[i].instance.views))
         known.append((arrivals[i], k))
     return state, accounts, known, rest
-
-
-def _place_parted(
-    state: State, t: int, gone: dict[int, float], rest: list[Arrival], observations, evidence: Evidence, *, eye: Eye,
-    config: Config, rng, progress,
-) -> tuple[State, dict[int, float], list[Account], list[tuple[Arrival, int]], list[Arrival]]:  # fmt: skip
-    """What left as one and is found nowhere, looked for as two, one that stood upon the other: the state, what left,
-    and the rest as `_place_known` returns it."""
-    accounts, known = [], []
-    for k in [k for k in gone if not bool(state.chronology.visible[t, k])]:
-        parted = part_burden(state, k) if rest else None
-        if parted is None:
-            continue
-        upper = len(parted.chronology.templates) - 1
-        both = {**gone, upper: gone[k]}
-        after, placed, which, others = _place_known(
-            parted, t, both, rest, observations, evidence,
-            among=(k, upper), eye=eye, config=config, rng=rng, progress=progress,
-        )  # fmt: skip
-        if placed:
-            progress.note(f"visit {t}: what stood upon object {parted.chronology.templates[k].identity} parted from it")
-            state, gone, rest = after, both, others
-            accounts, known = accounts + placed, known + which
-    return state, gone, accounts, known, rest
 
 
 def _beside(
@@ -368,10 +336,11 @@ def _crop_around(instance: Instance, observations, evidence: Evidence, config: C
 
 
 def _placements(
-    state: State, t: int, hidden: Sequence[int], arrivals: Sequence[Arrival], *, eye: Eye, config: Config, rng, progress
+    state: State, t: int, arrivals: Sequence[Arrival], *, eye: Eye, config: Config, rng, progress
 ) -> dict[tuple[int, int], Placement]:
     """Where each hidden template would stand as each arrival: the best few by a search, then settled."""
     placements = {}
+    hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
     sizes = {k: template_diameter(state.chronology.templates[k].splats) for k in hidden}
     for i, arrival in enumerate(arrivals):
         searches = {}

@@ -17,7 +17,6 @@ from ltgs_jax.template import (
     find_removed,
     gone_evidence,
     share_of,
-    stands_upon,
     taken_down,
 )
 
@@ -111,27 +110,14 @@ def _taken_down(
 ) -> tuple[Bool[np.ndarray, " m"], Support] | None:
     """The part of a template that was taken down from upon the rest, and the level it stood on; None where it left as
     a whole. What was carried together is one template until then."""
-    if state.supports[k] is None:
-        return None
-    part = taken_down(_on_support(state, k), left, stayed, least=least, config=config.template)
-    return None if part is None else (part, _level_under(state, k, part))
-
-
-def part_burden(state: State, k: int) -> State | None:
-    """Template k and what stands upon it, where its outline steps, as two, the latter last; None where it does not."""
-    part = None if state.supports[k] is None else stands_upon(_on_support(state, k))
-    return None if part is None else split_template(state, k, part, _level_under(state, k, part))
-
-
-def _on_support(state: State, k: int) -> Float[np.ndarray, "m 3"]:
-    """A template's splats along two axes of the surface it stood on, and its normal."""
-    return np.asarray(state.chronology.templates[k].splats.means, np.float64) @ state.supports[k].frame().T
-
-
-def _level_under(state: State, k: int, part: Bool[np.ndarray, " m"]) -> Support:
-    """The level on which a part of a template stands."""
     support = state.supports[k]
-    return Support(support.normal, float(np.quantile(_on_support(state, k)[part, 2], 0.02)), support.noise)
+    if support is None:
+        return None
+    points = np.asarray(state.chronology.templates[k].splats.means, np.float64) @ support.frame().T
+    part = taken_down(points, left, stayed, least=least, config=config.template)
+    if part is None:
+        return None
+    return part, Support(support.normal, float(np.quantile(points[part, 2], 0.02)), support.noise)
 
 
 def _streaks(

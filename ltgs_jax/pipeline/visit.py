@@ -88,7 +88,7 @@ def explain_visit(
         if instance.views > 1 or _strength(instance, evidence) > config.detect.alone
     ]
     progress.note(f"visit {t}: {len(gone)} left their place, {len(turned) + len(instances)} came")
-    state, gone, accounts = place_arrivals(
+    state, accounts = place_arrivals(
         state, t, gone, instances, observations, evidence, bared, surface, front_end, **tools
     )
     accounts += turned

@@ -20,7 +20,6 @@ from .removal import Removal as Removal
 from .removal import find_removed as find_removed
 from .removal import gone_evidence as gone_evidence
 from .removal import share_of as share_of
-from .removal import stands_upon as stands_upon
 from .removal import taken_down as taken_down
 from .support import Support as Support
 from .support import Vantage as Vantage

@@ -12,7 +12,6 @@ from ltgs_jax.scene import Splats
 from .cut import components
 from .locate import Crop, backdrop_unlikeness
 
-_REACH = 5  # usual distances of firm splats, up to which they hang together: at 3 some draws of a box fell apart
 _FIRM = 0.65  # of the upper quartile of unlikeness: where Otsu's threshold fell on objects of several scenes
 
 
@@ -33,7 +32,7 @@ def firm_part(splats: Splats, crop: Crop) -> tuple[Bool[np.ndarray, " n"], Bool[
         return np.ones(len(means), bool), np.asarray(crop.region)
     firm = np.flatnonzero(shown & (least > _FIRM * np.quantile(least[shown], 0.75)))
     spacing = np.median(cKDTree(means[firm]).query(means[firm], k=min(4, len(firm)))[0][:, -1])
-    largest = firm[components(means[firm], _REACH * spacing) == 0]
+    largest = firm[components(means[firm], 3 * spacing) == 0]
     outlines = np.zeros(unlike.shape, bool)
     for view, outline in enumerate(outlines):
         inside = largest[seen[view, largest]]

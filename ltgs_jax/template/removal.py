@@ -3,7 +3,7 @@
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
 from ltgs_jax.geometry import C0
 from ltgs_jax.scene import Splats
@@ -15,8 +15,7 @@ from .support import Support, Vantage, convex_footprint, fit_support
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
-_LEVELS = np.linspace(0.1, 0.9, 17)  # quantiles of height at which one thing may end upon another
-_STEP = 1.4  # growth of an outline from which on one thing stands upon another
+_STEP = 1.5  # growth of an outline from which on one thing stands upon another
 
 
 class Removal(eqx.Module):
@@ -63,7 +62,7 @@ def taken_down(
     parts the evidence best, at which the outline grows most: the foot of what was taken down tells little.
     """
     height = points[:, 2]
-    levels = np.quantile(height, _LEVELS)
+    levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
     net = left - stayed
     best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
     upper = height > levels[best]
@@ -71,36 +70,19 @@ def taken_down(
     parted = share_of(left[upper], stayed[upper]) > _OFF and share_of(left[~upper], stayed[~upper]) < config.whole
     if not (told and parted):
         return None
-    growth = _growth(points, levels[: best + 1])
+    thick = 0.1 * np.ptp(height)
+    growth = [
+        _extent(points[(height > level - thick) & (height <= level)])
+        / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
+        for level in levels[: best + 1]
+    ]
     step = int(np.argmax(growth))
     return height > levels[step] if growth[step] > _STEP else None
 
 
-def stands_upon(points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"] | None:
-    """The splats of one thing that stands upon another: those above the lowest level at which the outline steps; None
-    where it does not. `points` as `taken_down` takes them."""
-    levels = np.quantile(points[:, 2], _LEVELS)
-    growth = np.pad(_growth(points, levels), 1)
-    peaks = (growth[1:-1] >= np.maximum(growth[:-2], growth[2:])) & (growth[1:-1] > _STEP)
-    return points[:, 2] > levels[np.argmax(peaks)] if peaks.any() else None
-
-
-def _growth(points: Float[np.ndarray, "n 3"], levels: Float[np.ndarray, " l"]) -> Float[np.ndarray, " l"]:
-    """How much larger the outline is just below each level than just above; 0 where too little is above to tell."""
-    height = points[:, 2]
-    thick = 0.1 * np.ptp(height)
-    below = [_outline_area(points[(height > level - thick) & (height <= level)]) for level in levels]
-    above = [_outline_area(points[(height > level) & (height <= level + thick)]) for level in levels]
-    return np.array([b / a if a > 0 else 0.0 for b, a in zip(below, above, strict=True)])
-
-
-def _outline_area(points: Float[np.ndarray, "n 3"]) -> float:
-    """Area of the convex outline, along the first two axes, of the inner 95 % of points; 0 where there are too few."""
-    if len(points) < 8:
-        return 0.0
-    flat = points[:, :2] - np.median(points[:, :2], axis=0)
-    radius = np.linalg.norm(flat, axis=1)
-    return float(ConvexHull(flat[radius <= np.quantile(radius, 0.95)], qhull_options="QJ").volume)
+def _extent(points: Float[np.ndarray, "n 3"]) -> float:
+    """Area of the box, along the first two axes, that holds the central 90 % of points."""
+    return float(np.prod(np.ptp(np.quantile(points[:, :2], [0.05, 0.95], axis=0), axis=0))) if len(points) else 0.0
 
 
 def find_removed(
