@@ -158,7 +158,7 @@ def test_long_fit_changes_nothing_far_from_what_changed():
     recoloured = np.any(np.asarray(fitted.background.sh) != np.asarray(background.sh), axis=(1, 2))
     assert recoloured[:40].any() and not recoloured[40:].any()
     moved = np.any(np.asarray(fitted.background.means) != np.asarray(background.means), axis=1)
-    np.testing.assert_array_equal(moved & (np.asarray(since) == 0), False)
+    assert moved[:40].any() and not moved[np.asarray(since) == 0].any()  # late ground alone
     again, _ = fit_chronology(off, views, key=jax.random.key(0), config=LongConfig(passes=3))
     for a, b in zip(jax.tree.leaves(fitted), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
