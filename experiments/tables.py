@@ -74,7 +74,7 @@ PRESETS = {
             CaptureConfig(width=240, height=180, dense=30, points=4000),
             initial=InitialConfig(steps=500, max_splats=15_000, coarse_fraction=0.0),
         ),
-        steps=250,
+        steps=200,
         system="fast",
     ),
     "paper": Preset(
@@ -164,10 +164,9 @@ ABLATION = {
 # Values beside those of the preset, whose run is the ablation's "full".
 HYPERPARAMETERS = {
     "detect.sigmas": (3.0, 8.0),
-    "detect.gamma": (0.5, 0.9),
     "match.min_new": (0.15, 0.6),
     "template.tau_same": (0.02, 0.08),
-    "fit.long.passes": (4, 8, 32),
+    "fit.long.passes": (4, 32),
 }
 
 
