@@ -33,6 +33,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from ltgs_jax.cli.main import compile_quickly
 from ltgs_jax.pipeline.programs import free_programs
 
 MACHINE = ("seconds", "fps")
@@ -164,6 +165,7 @@ def run_all(
     `workers` local processes (0: in this one); `cluster` the address of a Dask scheduler instead. `deadline`: seconds
     of the wall clock after which no further run is started; the same command goes on later.
     """
+    compile_quickly()  # for the workers too, which take over the environment
     waiting = list({run.name: run for run in runs}.values())
     waiting = [run for run in waiting if retry or not (out / "runs" / run.name / "metrics.json").is_file()]
     started = time.perf_counter()

@@ -8,6 +8,10 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import pytest
 
+from ltgs_jax.cli.main import compile_quickly
+
+compile_quickly()
+
 
 @pytest.fixture(scope="session")
 def shared() -> Path:

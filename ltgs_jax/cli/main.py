@@ -4,6 +4,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 
 from .arguments import UsageError, parse
@@ -17,6 +18,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     0 done; 2 the input or an option is wrong, one line on stderr; 130 interrupted; 1 anything else.
     """
     keep_compiled_code()
+    compile_quickly()
     try:
         options = parse(sys.argv[1:] if argv is None else argv)
     except SystemExit as stop:
@@ -63,6 +65,18 @@ def keep_compiled_code() -> None:
         return  # no home to write to: compile each time
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+
+
+def compile_quickly() -> None:
+    """Have XLA compile for the CPU by its older emitters: a third less time to compile, a tenth more to run.
+
+    Set by name, and only for the release that was measured, since XLA ends a process over a name that it does not know.
+    Has no effect once jax is imported.
+    """
+    flag = "--xla_cpu_use_fusion_emitters"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if flag not in flags and version("jaxlib").startswith("0.10."):
+        os.environ["XLA_FLAGS"] = f"{flags} {flag}=false".strip()
 
 
 def _say(message: str, status: int) -> int:

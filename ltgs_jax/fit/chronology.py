@@ -16,7 +16,7 @@ from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_sp
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
 from .views import StreamedView, View, plan_for, scene_extent, size_of
-from .windows import Window, window_side, windows_of, within_change
+from .windows import Shown, Window, window_side, windows_of, within_change
 
 
 @dataclass(frozen=True)
@@ -204,12 +204,12 @@ def fit_chronology(
     late = np.zeros(background.count, bool) if since is None else np.asarray(since) > 0
     owner = np.repeat(np.arange(1 + len(templates)), [background.count, *(m.splats.count for m in templates)])
     came = np.where(owner == 0, np.pad(late, (0, len(owner) - len(late))), True)
-    windows, votes = [], np.zeros((len(owner), 2))
-    for visit in sorted({v.visit for v in views}):
-        splats = jax.tree.map(np.asarray, _composed(chronology, jnp.asarray(visit)))
-        touched = came & (splats.logit_opacities > -np.inf)
-        found, cast = windows_of([v.view for v in views if v.visit == visit], visit, splats, touched, side=side)
-        windows, votes = windows + found, votes + cast
+    visits = {}
+    for t in sorted({v.visit for v in views}):
+        splats = jax.tree.map(np.asarray, _composed(chronology, jnp.asarray(t)))
+        shown = tuple(v.view for v in views if v.visit == t)
+        visits[t] = Shown(shown, splats, came & (splats.logit_opacities > -np.inf))
+    windows, votes = windows_of(visits, side=side)
     every = jax.tree.map(np.array, concatenate_splats([background, *(m.splats for m in templates)]))
     placements = placements_of(chronology)
     diameters = np.asarray([template_diameter(m.splats) for m in templates], np.float32)

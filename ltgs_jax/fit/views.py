@@ -1,6 +1,6 @@
 """Photographs as the fit sees them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -106,7 +106,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return float(1.1 * np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()) or 1.0
 
 
-def plan_for(pairs: Sequence[tuple[Splats, Camera]], *, slack: float = 1.3) -> RenderPlan:
+def plan_for(pairs: Iterable[tuple[Splats, Camera]], *, slack: float = 1.3) -> RenderPlan:
     """One plan that serves each of these renders alone, so that one compilation does."""
     plans = [plan_render(splats, camera, slack=slack) for splats, camera in pairs]
     return RenderPlan(max(p.intersections for p in plans), max(p.rounds for p in plans))

@@ -82,40 +82,47 @@ def _starts(low: int, high: int, side: int, length: int) -> list[int]:
     return sorted({int(np.clip(start, 0, length - side)) for start in starts})
 
 
-def windows_of(
-    views: Sequence[View | StreamedView], visit: int, splats: Splats, touched: Bool[np.ndarray, " n"], *, side: int
-) -> tuple[list[Window], Float[np.ndarray, "n 2"]]:
-    """Windows of side `side` on what change touches in the photographs of a visit; and what each splat paints (Σ αT) of
-    their touched pixels, and of all.
+class Shown(eqx.Module):
+    """One visit: its photographs, the scene, and which of its splats [n] came, moved, or lie where something left."""
 
-    `splats` the scene at that visit, `touched` those of them that came, moved, or lie where something left. A pixel is
-    touched where these give `_SHOWS` of its colour, dilated by a twentieth of a window.
+    views: tuple[View | StreamedView, ...]
+    splats: Splats
+    touched: Bool[np.ndarray, " n"]
+
+
+def windows_of(visits: dict[int, Shown], *, side: int) -> tuple[list[Window], Float[np.ndarray, "n 2"]]:
+    """Windows of side `side` on what change touches in the photographs of each visit; and what each splat paints (Σ αT)
+    of their touched pixels, and of all. Scenes of all visits have the same splats, hidden where they do not show.
+
+    A pixel is touched where touched splats give `_SHOWS` of its colour, dilated by a twentieth of a window.
     """
     margin = max(2, side // 20)
     parts = [
-        (view, left, top, crop_camera(view.camera, left, top, side))
-        for view, outline in zip(views, _outlines(splats[touched], views, margin), strict=True)
+        (t, view, left, top, crop_camera(view.camera, left, top, side))
+        for t, view, outline in _outlines(visits, margin)
         for left, top in cover_region(outline, side, margin)
     ]
-    windows, votes = [], np.zeros((splats.count, 2))
-    rows = [np.flatnonzero(_in_view(splats, camera)) for *_, camera in parts]
-    most = max((len(r) for r in rows), default=0)
-    inputs = []
-    for r, (*_, camera) in zip(rows, parts, strict=True):
-        padded = pad_splats(splats[r], _bucket(most))
-        flags = np.pad(touched[r].astype(np.float32), (0, padded.count - len(r)))
-        inputs.append((padded, camera, flags))
-    if not inputs:
+    windows: list[Window] = []
+    votes = np.zeros((next(iter(visits.values())).splats.count, 2))
+    rows = [np.flatnonzero(_in_view(visits[t].splats, camera)) for t, *_, camera in parts]
+    if not rows:
         return windows, votes
-    plan = plan_for([(padded, camera) for padded, camera, _ in inputs])
-    for r, (view, left, top, camera), (padded, _, flags) in zip(rows, parts, inputs, strict=True):
-        count, cast = _window_votes(padded, camera, flags, margin, plan)
+    bucket = _bucket(max(len(r) for r in rows))
+
+    def scene(t: int, r: Int[np.ndarray, " m"]) -> Splats:
+        return pad_splats(visits[t].splats[r], bucket)
+
+    # One plan, and one number of splats, for the windows of all visits: one program.
+    plan = plan_for((scene(t, r), camera) for r, (t, *_, camera) in zip(rows, parts, strict=True))
+    for r, (t, view, left, top, camera) in zip(rows, parts, strict=True):
+        flags = np.pad(visits[t].touched[r].astype(np.float32), (0, bucket - len(r)))
+        count, cast = _window_votes(scene(t, r), camera, flags, margin, plan)
         if int(count) < _LEAST:
             continue
         votes[r] += np.asarray(cast)[: len(r)]
         part = np.s_[top : top + side, left : left + side]
-        shown = r[np.asarray(cast)[: len(r), 1] > _SEEN]
-        windows.append(Window(camera, view.image[part], view.mask[part], visit, shown))
+        showing = r[np.asarray(cast)[: len(r), 1] > _SEEN]
+        windows.append(Window(camera, view.image[part], view.mask[part], t, showing))
     return windows, votes
 
 
@@ -124,15 +131,16 @@ def within_change(votes: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     return (votes[:, 0] > _SEEN) & (votes[:, 0] > _INSIDE * votes[:, 1])
 
 
-def _outlines(splats: Splats, views: Sequence[View | StreamedView], margin: int) -> list[Bool[np.ndarray, "h w"]]:
-    """Where splats would show if nothing stood before them, dilated."""
-    padded = pad_splats(splats, _bucket(splats.count))
-    plans = {
-        size: plan_for([(padded, view.camera) for view in views if size_of(view) == size])
-        for size in {size_of(view) for view in views}
-    }
-    alphas = [np.asarray(_alpha(padded, view.camera, plans[size_of(view)])) for view in views]
-    return [ndimage.maximum_filter(alpha > _SHOWS, size=2 * margin + 1) for alpha in alphas]
+def _outlines(visits: dict[int, Shown], margin: int):
+    """Visit, photograph and, dilated, where its touched splats would show in it if nothing stood before them."""
+    bucket = _bucket(max(int(shown.touched.sum()) for shown in visits.values()))
+    scenes = {t: pad_splats(shown.splats[shown.touched], bucket) for t, shown in visits.items()}
+    every = [(t, view) for t, shown in visits.items() for view in shown.views]
+    sizes = {size_of(view) for _, view in every}
+    plans = {size: plan_for([(scenes[t], v.camera) for t, v in every if size_of(v) == size]) for size in sizes}
+    for t, view in every:
+        alpha = np.asarray(_alpha(scenes[t], view.camera, plans[size_of(view)]))
+        yield t, view, ndimage.maximum_filter(alpha > _SHOWS, size=2 * margin + 1)
 
 
 def _bucket(count: int) -> int:

@@ -406,11 +406,10 @@ def _as_new(
 
 
 def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
-    """The least, over views, overlap (IoU) of a known template's outlines with those of the change as a new object."""
+    """Overlap (IoU), over all views, of a known template's outlines with those of the change as a new object."""
     valid = np.asarray(crop.valid)
-    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
-    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
-    return float(np.min((both / np.maximum(either, 1))[either > 8])) if (either > 8).any() else 0.0
+    either = ((found.outlines | new.outlines) & valid).sum()
+    return float((found.outlines & new.outlines & valid).sum() / max(either, 1))
 
 
 def _add_new(

@@ -11,15 +11,16 @@ from jaxtyping import Bool, Float
 from ltgs_jax.detect import ChangeMap, change_map, similarity
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import StreamedView, View
-from ltgs_jax.geometry import Camera
+from ltgs_jax.geometry import Camera, eval_sh
 from ltgs_jax.match import Cone
-from ltgs_jax.render import RenderPlan, plan_render, render, splat_votes
+from ltgs_jax.render import RenderOutput, RenderPlan, plan_render, render, splat_votes
 from ltgs_jax.scene import Splats, pad_splats
 from ltgs_jax.template import Refiner, Vantage
 
 from .config import Config
 
-_BUCKET = 8192  # splat counts are padded to multiples of this, so that a cut or an addition compiles nothing anew
+_BUCKET = 8192  # splats are padded to one multiple of this, so that a cut or an addition compiles nothing anew
+_ROOM = 1.15  # what that leaves for splats to come
 
 
 class Observation(eqx.Module):
@@ -46,14 +47,17 @@ def on_host(splats: Splats) -> Splats:
 
 
 @eqx.filter_jit
-def _render(splats: Splats, camera: Camera, plan: RenderPlan):
-    return render(splats, camera, plan=plan)
+def _show(splats: Splats, camera: Camera, value, plan: RenderPlan):
+    """The image, and one more value of the splats [n 1] composited with it."""
+    direction = splats.means - camera.center()
+    direction = direction / jnp.maximum(jnp.linalg.norm(direction, axis=-1, keepdims=True), 1e-9)
+    colors = jnp.concatenate([eval_sh(splats.sh, direction), value], axis=-1)
+    return render(splats, camera, plan=plan, colors=colors)
 
 
 @eqx.filter_jit
-def _render_values(splats: Splats, camera: Camera, values, plan: RenderPlan):
-    out = render(splats, camera, plan=plan, colors=values)
-    return out.image, out.overflow
+def _paint(splats: Splats, camera: Camera, values, plan: RenderPlan):
+    return render(splats, camera, plan=plan, colors=values).image
 
 
 @eqx.filter_jit
@@ -62,18 +66,25 @@ def _votes(splats: Splats, camera: Camera, values, plan: RenderPlan):
 
 
 class Eye:
-    """Renders whole photographs; keeps one generous plan per image size and bucket, growing it when one overflows."""
+    """Renders whole photographs by few programs: one number of splats, padded, for all scenes, and one generous plan
+    per image size; either grows when it no longer serves."""
 
     def __init__(self) -> None:
+        self._count = 0
         self._plans: dict[tuple[int, int, int], RenderPlan] = {}
         self.refiner = Refiner()
 
-    def _plan(self, splats: Splats, camera: Camera) -> RenderPlan:
-        key = (splats.count, camera.width, camera.height)
-        needed = plan_render(splats, camera, slack=1.0)
+    def _padded(self, splats: Splats) -> Splats:
+        if splats.count > self._count:
+            self._count = -(-round(_ROOM * splats.count) // _BUCKET) * _BUCKET
+        return pad_splats(splats, self._count)
+
+    def _plan(self, padded: Splats, camera: Camera) -> RenderPlan:
+        key = (padded.count, camera.width, camera.height)
+        needed = plan_render(padded, camera, slack=1.0)
         held = self._plans.get(key)
         if held is None or needed.intersections > held.intersections or needed.rounds > held.rounds:
-            roomy = plan_render(splats, camera, slack=1.8)
+            roomy = plan_render(padded, camera, slack=1.8)
             held = (
                 roomy
                 if held is None
@@ -82,29 +93,29 @@ class Eye:
             self._plans[key] = held
         return held
 
+    def _show(self, splats: Splats, camera: Camera, value: Float[np.ndarray, " n"]) -> RenderOutput:
+        padded = self._padded(splats)
+        value = np.pad(np.asarray(value, np.float32), (0, padded.count - splats.count))[:, None]
+        return _show(padded, camera, value, self._plan(padded, camera))
+
     def look(self, splats: Splats, camera: Camera, errors: Float[np.ndarray, " n"]) -> Look:
         """Image, alpha, depth and expected dissimilarity; where little is, nothing is expected to agree."""
-        padded = pad_splats(splats, _BUCKET)
-        plan = self._plan(padded, camera)
-        out = _render(padded, camera, plan)
-        values = np.pad(np.asarray(errors, np.float32), (0, padded.count - splats.count))[:, None]
-        expected, _ = _render_values(padded, camera, values, plan)
-        alpha = np.asarray(out.alpha)
+        out = self._show(splats, camera, errors)
+        image, alpha = np.asarray(out.image), np.asarray(out.alpha)
         unknown = np.clip(1 - 2 * alpha, 0, 1)
-        return Look(
-            np.clip(np.asarray(out.image), 0, 1), alpha, np.asarray(out.depth), np.asarray(expected)[..., 0] + unknown
-        )
+        return Look(np.clip(image[..., :3], 0, 1), alpha, np.asarray(out.depth), image[..., 3] + unknown)
 
     def image(self, splats: Splats, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """The image alone, in 0…1."""
-        padded = pad_splats(splats, _BUCKET)
-        return np.clip(np.asarray(_render(padded, camera, self._plan(padded, camera)).image), 0, 1)
+        return np.clip(np.asarray(self._show(splats, camera, np.zeros(splats.count)).image)[..., :3], 0, 1)
 
     def paint(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "n c"]) -> Float[np.ndarray, "h w c"]:
         """Any values of the splats, composited as colours are."""
-        padded = pad_splats(splats, _BUCKET)
+        if values.shape[1] == 1:
+            return np.asarray(self._show(splats, camera, values[:, 0]).image)[..., 3:]
+        padded = self._padded(splats)
         values = np.pad(np.asarray(values, np.float32), ((0, padded.count - splats.count), (0, 0)))
-        return np.asarray(_render_values(padded, camera, values, self._plan(padded, camera))[0])
+        return np.asarray(_paint(padded, camera, values, self._plan(padded, camera)))
 
     def cover(
         self, scene: tuple, templates: Sequence[int], observations: Sequence[Observation]
@@ -116,7 +127,7 @@ class Eye:
 
     def votes(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "n m"]:
         """Σ αT·value per splat."""
-        padded = pad_splats(splats, _BUCKET)
+        padded = self._padded(splats)
         votes = _votes(padded, camera, jnp.asarray(values, jnp.float32), self._plan(padded, camera))
         return np.asarray(votes)[: splats.count]
 

@@ -16,7 +16,7 @@ class RenderConfig:
     """Static options of the renderer.
 
     `tile_size` [px] side of a square tile; `chunk` splats blended per step of a tile; `tiles_per_block` tiles that
-    advance together (None: 128 on CPUs, where a block should stay in the cache, all tiles on other devices);
+    advance together (None: 64 on CPUs, where a block should stay in the cache, all tiles on other devices);
     `near` [scene units] camera z below which a splat is culled.
     """
 

@@ -64,25 +64,11 @@ def tile_boxes(projected: Projected, grid: Grid) -> Int[Array, "m 4"]:
     return jnp.concatenate([jnp.where(empty, 0, low), jnp.where(empty, 0, high)], axis=-1)
 
 
-def _camera_of_rows(grid: Grid, count: int) -> Int[Array, " m"]:
-    """The camera of each of `count` = cameras·n rows."""
-    return jnp.repeat(jnp.arange(grid.cameras, dtype=jnp.int32), count // grid.cameras)
-
-
 def drop_inactive(boxes: Int[Array, "m 4"], grid: Grid, active: Int[Array, " tiles"]) -> Int[Array, "m 4"]:
     """Empty the boxes that hold no active tile, by the sums of a summed-area table."""
     table = active.reshape(grid.cameras, grid.rows, grid.columns)
     table = jnp.pad(jnp.cumsum(jnp.cumsum(table, axis=1), axis=2), ((0, 0), (1, 0), (1, 0)))
-    camera = _camera_of_rows(grid, boxes.shape[0])
+    camera = jnp.repeat(jnp.arange(grid.cameras, dtype=jnp.int32), boxes.shape[0] // grid.cameras)
     x0, y0, x1, y1 = (boxes[:, j] for j in range(4))
     inside = table[camera, y1, x1] - table[camera, y0, x1] - table[camera, y1, x0] + table[camera, y0, x0]
     return jnp.where(inside[:, None] > 0, boxes, 0)
-
-
-def count_boxes(boxes: Int[Array, "m 4"], grid: Grid) -> Int[Array, " tiles"]:
-    """How many boxes cover each tile: a box adds one at two of its corners and takes one at the others, then sums."""
-    camera = _camera_of_rows(grid, boxes.shape[0])
-    corners = jnp.zeros((grid.cameras, grid.rows + 1, grid.columns + 1), jnp.int32)
-    for row, column, sign in ((1, 0, 1), (1, 2, -1), (3, 0, -1), (3, 2, 1)):
-        corners = corners.at[camera, boxes[:, row], boxes[:, column]].add(sign)
-    return jnp.cumsum(jnp.cumsum(corners, axis=1), axis=2)[:, :-1, :-1].reshape(-1)

@@ -4,7 +4,6 @@ import functools
 import math
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
@@ -12,9 +11,9 @@ from ltgs_jax.geometry import Camera
 from ltgs_jax.scene import Splats
 
 from .config import RenderConfig, RenderPlan
-from .grid import Grid, count_boxes, drop_inactive, tile_boxes
+from .grid import Grid, drop_inactive, tile_boxes
 from .project import project_splats
-from .slots import block_rounds, tiles_per_block
+from .slots import tiles_per_block
 
 # Plans made so far by the kind of program: reusing one saves a compilation, and the result does not depend on it.
 _made: dict[tuple, set[RenderPlan]] = {}
@@ -52,23 +51,39 @@ def _round_up(count: float, least: int) -> int:
     return -(-count // step) * step
 
 
-@functools.partial(jax.jit, static_argnames=("config",))
-def _count(splats: Splats, cameras: Camera, tiles, *, config: RenderConfig) -> tuple[Int[Array, ""], Int[Array, ""]]:
-    """Pairs of splat and tile by bounding box, and the rounds that they need: upper bounds of what rendering finds."""
-    projected = jax.lax.stop_gradient(project_splats(splats, cameras, near=config.near))
+@functools.partial(jax.jit, static_argnames=("grid", "config"))
+def _boxes(splats: Splats, cameras: Camera, active, *, grid: Grid, config: RenderConfig) -> Int[Array, "m 4"]:
+    """The box of tiles of every splat in every camera; those without an `active` tile are empty."""
+    boxes = tile_boxes(project_splats(splats, cameras, near=config.near), grid)
+    return boxes if active is None else drop_inactive(boxes, grid, active)
+
+
+def _count(splats: Splats, cameras: Camera, tiles, config: RenderConfig) -> tuple[int, int]:
+    """Pairs of splat and tile by bounding box, and the rounds that they need: upper bounds of what rendering finds.
+
+    Boxes are counted on the host: for each new shape of splats, sorts and scatters would take XLA seconds to compile.
+    """
     grid = Grid(cameras.width, cameras.height, config.tile_size, cameras.K.shape[0])
-    boxes = tile_boxes(projected, grid)
-    chosen = None
-    if tiles is not None:
-        chosen, active = grid.choose(tiles)
-        boxes = drop_inactive(boxes, grid, active)
-    counts = count_boxes(boxes, grid)
+    chosen, active = (None, None) if tiles is None else grid.choose(tiles)
+    boxes = np.asarray(_boxes(splats, cameras, active, grid=grid, config=config)).astype(np.int64)
+    counts = _count_boxes(boxes, grid)
     if chosen is not None:
-        counts = jnp.where(chosen >= 0, counts[chosen], 0)
-    _, rounds = block_rounds(counts, tiles_per_block(config, counts.shape[0]), config.chunk)
-    with jax.enable_x64(True):
-        pairs = jnp.sum((boxes[:, 2] - boxes[:, 0]).astype(jnp.int64) * (boxes[:, 3] - boxes[:, 1]).astype(jnp.int64))
-    return pairs, jnp.sum(rounds)
+        chosen = np.asarray(chosen)
+        counts = np.where(chosen >= 0, counts[chosen], 0)
+    longest = np.sort(counts)[::-1][:: tiles_per_block(config, len(counts))]
+    pairs = ((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum()
+    return int(pairs), int((-(-longest // config.chunk)).sum())
+
+
+def _count_boxes(boxes: Int[np.ndarray, "m 4"], grid: Grid) -> Int[np.ndarray, " tiles"]:
+    """How many boxes cover each tile: a box adds one at two of its corners and takes one at the others, then sums."""
+    shape = grid.cameras, grid.rows + 1, grid.columns + 1
+    first = np.repeat(np.arange(grid.cameras), len(boxes) // grid.cameras) * (shape[1] * shape[2])
+    corners = np.zeros(shape, np.int64)
+    for row, column, sign in ((1, 0, 1), (1, 2, -1), (3, 0, -1), (3, 2, 1)):
+        place = first + boxes[:, row] * shape[2] + boxes[:, column]
+        corners += sign * np.bincount(place, minlength=corners.size).reshape(shape)
+    return corners.cumsum(axis=1).cumsum(axis=2)[:, :-1, :-1].reshape(-1)
 
 
 def plan_render(
@@ -101,5 +116,4 @@ def plan_render(
         return RenderPlan(intersections=1024, rounds=16)
     kind = (splats.count, cameras.K.shape[0], cameras.width, cameras.height, config, tiles is None or tiles.shape)
     batch_tiles = tiles if tiles is None or camera.K.ndim == 3 else tiles[None]
-    pairs, rounds = _count(splats, cameras, batch_tiles, config=config)
-    return _settle(kind, int(pairs), int(rounds), slack)
+    return _settle(kind, *_count(splats, cameras, batch_tiles, config), slack)

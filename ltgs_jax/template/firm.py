@@ -12,6 +12,7 @@ from ltgs_jax.scene import Splats
 from .cut import components
 from .locate import Crop, backdrop_unlikeness
 
+_PADDED = 2048  # places are projected in multiples of this many
 _FIRM = 0.65  # of the upper quartile of unlikeness: where Otsu's threshold fell on objects of several scenes
 
 
@@ -47,7 +48,8 @@ _project = jax.jit(jax.vmap(Camera.project, (0, None)))
 
 def _pixels_of(means: Float[np.ndarray, "n 3"], crop: Crop) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether each window sees the place of each splat, and the row and column of the pixel that does, all [v n]."""
-    xy, z = _project(crop.camera, np.asarray(means, np.float32))
+    padded = np.pad(means, ((0, -len(means) % _PADDED), (0, 0))).astype(np.float32)  # few shapes, few programs
+    xy, z = (x[:, : len(means)] for x in _project(crop.camera, padded))
     size = crop.camera.width
     column, row = np.floor(np.nan_to_num(np.moveaxis(np.asarray(xy), -1, 0), nan=-1.0)).clip(-1, size).astype(int)
     seen = (np.asarray(z) > 1e-3) & (row >= 0) & (row < size) & (column >= 0) & (column < size)
