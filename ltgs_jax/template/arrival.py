@@ -120,8 +120,8 @@ def thin(splats: Splats, most: int) -> Splats:
 
 
 class Search(eqx.Module):
-    """Promising poses of a template, from one surface to another, and the mean unlikeness with it at each, in coarse
-    windows; the error `without` it, and the part of that which is to be explained."""
+    """Promising poses of a template, from one surface to another, and the mean unlikeness with it at each; the error
+    `without` it, and the part of that which is to be explained."""
 
     template: Splats
     stood_on: Support
@@ -155,11 +155,14 @@ def search_template(
 
     Upright first, and at its pose `before`; unless `upright`, on its other sides too if upright explains little. The
     best few, unlike each other.
+
+    Coarse windows tell the right one of a template's poses, and not one template from another: at half the size even a
+    box where it stands may explain nothing. What the best few explain is measured in the windows themselves.
     """
     light = thin(template.splats, config.search_splats)
     points = _shown_points(light)
     coarse = half_crop(crop)
-    without, change = backdrop_error(coarse)
+    without, change = backdrop_error(crop)
     best: Search | None = None
     for tilts, turns in (([np.eye(3)], config.yaw_steps), (tilts_of(stood_on), config.yaw_steps // 2)):
         hypotheses = pose_hypotheses(points, stood_on, stands_on, places, turns=turns, spread=size, tilts=tilts)
@@ -167,9 +170,10 @@ def search_template(
             hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
         scores = refiner.score(light, hypotheses, coarse, tolerance=0.1 * size)
         chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
-        poses, errors = refiner.slide(
+        poses = refiner.slide(
             light, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, tolerance=0.1 * size, rng=rng
         )
+        errors = refiner.score(light, poses, crop, tolerance=0.1 * size)
         order = np.argsort(errors, kind="stable")
         found = Search(light, stood_on, stands_on, poses[order], errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():

@@ -312,16 +312,16 @@ class Refiner:
         tolerance: float,
         rng: np.random.Generator,
         rounds: int = 6,
-    ) -> tuple[SE3, Float[np.ndarray, " m"]]:
+    ) -> SE3:
         """Each of m poses moved over the surface of unit `normal` and turned about it, to where it is least unlike the
-        photographs: in every round the best of random steps around it, steps shrinking. Returns poses and unlikeness.
+        photographs: in every round the best of random steps around it, steps shrinking.
 
         Two in-plane shifts and a turn: the other three freedoms would let a wrong pose sink or tilt to please.
         """
         m = poses.xyz.shape[0]
         center = np.asarray(_middle(template).xyz, np.float64)
         axes = np.linalg.svd(normal[None])[2][1:]
-        best, best_errors = np.asarray(poses.as_matrix(), np.float64), np.full(m, np.inf)
+        best = np.asarray(poses.as_matrix(), np.float64)
         tries = _BATCH // m
         for r in range(rounds):
             steps = rng.normal(size=(m, tries, 3)) * np.array([0.25 * size, 0.25 * size, 0.35]) * 0.65**r
@@ -334,9 +334,8 @@ class Refiner:
             )
             flat = SE3.from_matrix(jnp.asarray(trial.reshape(-1, 4, 4), jnp.float32))
             errors = self.score(template, flat, crop, tolerance=tolerance).reshape(m, tries)
-            winner = errors.argmin(axis=1)
-            best, best_errors = trial[np.arange(m), winner], errors[np.arange(m), winner]
-        return SE3.from_matrix(jnp.asarray(best, jnp.float32)), best_errors
+            best = trial[np.arange(m), errors.argmin(axis=1)]
+        return SE3.from_matrix(jnp.asarray(best, jnp.float32))
 
     def refine(
         self,
