@@ -406,10 +406,13 @@ def _as_new(
 
 
 def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
-    """Overlap (IoU), over all views, of a known template's outlines with those of the change as a new object."""
+    """The least overlap (IoU) of a known template's outlines with those of the change as a new object, over the views
+    that show enough of it."""
     valid = np.asarray(crop.valid)
-    either = ((found.outlines | new.outlines) & valid).sum()
-    return float((found.outlines & new.outlines & valid).sum() / max(either, 1))
+    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
+    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
+    enough = either > max(0.2 * either.max(), 8)
+    return float(np.min(both[enough] / either[enough], initial=1.0))
 
 
 def _add_new(
