@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
+from skimage.morphology import convex_hull_image
 
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
@@ -43,6 +44,7 @@ _TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and s
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
+_COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -407,12 +409,13 @@ def _as_new(
 
 def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
     """The least overlap (IoU) of a known template's outlines with those of the change as a new object, over the views
-    that show enough of it."""
+    that show enough of it and in which the new one has a shape to compare; 1 where none has."""
     valid = np.asarray(crop.valid)
     both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
     either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
     enough = either > max(0.2 * either.max(), 8)
-    return float(np.min(both[enough] / either[enough], initial=1.0))
+    judges = enough & [outline.sum() > _COMPACT * convex_hull_image(outline).sum() for outline in new.outlines]
+    return float(np.min(both[judges] / either[judges], initial=1.0))
 
 
 def _add_new(
