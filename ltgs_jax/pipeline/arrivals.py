@@ -414,7 +414,7 @@ def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
     both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
     either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
     enough = either > max(0.2 * either.max(), 8)
-    judges = enough & [outline.sum() > _COMPACT * convex_hull_image(outline).sum() for outline in new.outlines]
+    judges = enough & [o.any() and o.sum() > _COMPACT * convex_hull_image(o).sum() for o in new.outlines]
     return float(np.min(both[judges] / either[judges], initial=1.0))
 
 
