@@ -174,9 +174,9 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     """All tables, in the order in which they are worked on."""
     scene = preset.scenes[min(1, len(preset.scenes) - 1)]
     base = SystemConfig(vary(preset.scene, "capture.scene", scene), preset.system)
-    views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 4, 6))
-    poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.1, 0.3, 1.0))
-    features = grid(_SYSTEM, base, feature_noise=(0.0, 0.1, 0.3, 1.0))
+    views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 6))
+    poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
+    features = grid(_SYSTEM, base, feature_noise=(0.0, 0.3, 1.0))
     hyper = _variants(preset, scene, {"as it is": ()})
     for name, values in HYPERPARAMETERS.items():
         hyper |= _variants(preset, scene, {f"{name} {value}": ((name, value),) for value in values})

@@ -50,7 +50,7 @@ class TemplateConfig:
     its outlines cover), from which on a known template is what came."""
     tau_sure: float = 0.2
     """The same product, from which on the outlines need not be compared."""
-    tau_shape: float = 0.55
+    tau_shape: float = 0.5
     """Least overlap (IoU), over views, of a known template's outlines with those of the change as a new object."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that nothing in the photographs speaks against."""
