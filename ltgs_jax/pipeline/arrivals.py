@@ -151,7 +151,7 @@ def _place_known(
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
     as_new: dict[int, NewObject | None] = {}
     for (i, k), found in list(placements.items()):
-        if not _convincing(found, config) or _worth(found) > config.template.tau_sure:
+        if not _convincing(found, config) or found.worth > config.template.tau_sure:
             continue
         if i not in as_new:
             as_new[i] = _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
@@ -291,13 +291,8 @@ def _still_changed(
     return bool(now > config.template.tau_remains * max(was, 1))
 
 
-def _worth(found: Placement) -> float:
-    """Evidence for a known template: it explains the change, looks like the photographs, and leaves none of it out."""
-    return found.gain * found.likeness * found.recall if min(found.gain, found.likeness) > 0 else 0.0
-
-
 def _convincing(found: Placement, config: Config) -> bool:
-    return found.overlap > config.template.tau_outline and _worth(found) > config.template.tau_same
+    return found.overlap > config.template.tau_outline and found.worth > config.template.tau_same
 
 
 def _window(instance: Instance, observations) -> list[tuple[float, float, float]]:
@@ -376,7 +371,7 @@ def _placements(
 
 def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:
     """Each arrival with the template it is, or None for a new object: one assignment, best evidence in total."""
-    good = {pair: _worth(found) for pair, found in placements.items() if _convincing(found, config)}
+    good = {pair: found.worth for pair, found in placements.items() if _convincing(found, config)}
     known = sorted({k for _, k in good})
     cost = np.zeros((count, len(known) + count))
     for (i, k), worth in good.items():

@@ -39,6 +39,11 @@ class Placement(eqx.Module):
     recall: float
     outlines: Bool[np.ndarray, "v s s"]
 
+    @property
+    def worth(self) -> float:
+        """Evidence for the template: it explains the change, looks like the photographs, and leaves none of it out."""
+        return self.gain * self.likeness * self.recall if min(self.gain, self.likeness) > 0 else 0.0
+
 
 def middle_of(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     """The middle of the box that holds the central 90 % of points along each axis: where the seen side of an object has
@@ -186,8 +191,8 @@ def search_template(
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
     """Refine the best two poses of a search on the pixels, in all six freedoms, then the best two turns in place of
-    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. It
-    stands upright, as it stood, unless the pixels clearly say that it leans.
+    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell.
+    It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
     options = {"size": size, "tolerance": 0.1 * size, "blurred": 3}
     found = refiner.refine(search.template, search.poses[:2], crop, steps=12, **options)
