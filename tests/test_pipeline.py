@@ -192,3 +192,26 @@ def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
     assert any(used[0].name in line and line.startswith("warning") for line in progress.lines)
     with pytest.raises(InputError, match="none of the photographs"):
         update_stage.load_views(run, used[:1], progress)
+
+
+def test_shreds_are_no_shape_to_hold_against_a_known_object():
+    from types import SimpleNamespace
+
+    from ltgs_jax.pipeline.arrivals import _same_shape
+
+    box, other = np.zeros((40, 40), bool), np.zeros((40, 40), bool)
+    box[5:25, 5:25] = True
+    other[5:25, 15:35] = True
+    shreds = np.zeros((40, 40), bool)
+    shreds[::3, ::3] = True
+    crop = SimpleNamespace(valid=np.ones((2, 40, 40), bool))
+
+    def shape(*new: np.ndarray) -> float:
+        found = SimpleNamespace(outlines=np.stack([box, box]))
+        return _same_shape(found, SimpleNamespace(outlines=np.stack(new)), crop)
+
+    assert shape(box, box) == 1
+    assert np.isclose(shape(box, other), 1 / 3)
+    assert shape(box, shreds) == 1
+    assert shape(shreds, shreds) == 1
+    assert np.isclose(shape(shreds, other), 1 / 3)

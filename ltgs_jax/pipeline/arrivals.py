@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.cluster.vq import kmeans2
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
-from skimage.morphology import convex_hull_image
+from scipy.spatial import ConvexHull, cKDTree
 
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
@@ -409,8 +408,14 @@ def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
     both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
     either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
     enough = either > max(0.2 * either.max(), 8)
-    judges = enough & [o.any() and o.sum() > _COMPACT * convex_hull_image(o).sum() for o in new.outlines]
+    judges = enough & [outline.sum() > _COMPACT * _hull_area(outline) for outline in new.outlines]
     return float(np.min(both[judges] / either[judges], initial=1.0))
+
+
+def _hull_area(outline: Bool[np.ndarray, "s s"]) -> float:
+    """Pixels within the convex hull of an outline's pixels, corners and all; 0 of none."""
+    corners = np.argwhere(outline)[:, None] + np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
+    return float(ConvexHull(corners.reshape(-1, 2)).volume) if outline.any() else 0.0
 
 
 def _add_new(
