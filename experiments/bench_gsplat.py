@@ -10,9 +10,6 @@ without antialiasing and blur by 0.3 px²; opacities are cut at 0.99 here and at
 
 import itertools
 import json
-import statistics
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,12 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from experiments.bench_render import load_workload, subsample
+from experiments.bench_render import bench, load_workload, measure, subsample
 from ltgs_jax.geometry import Camera
-from ltgs_jax.render import RenderConfig, plan_render, render
+from ltgs_jax.render import RenderConfig, render
 from ltgs_jax.scene import Splats
 
-_REPEATS = 20
 _MANY = 1_000_000
 
 
@@ -40,42 +36,6 @@ class Options:
     chunks: tuple[int, ...] = (RenderConfig().chunk,)
     blocks: tuple[int, ...] = (0,)
     """Tiles that advance together; 0: what the renderer takes for this device."""
-
-
-def _milliseconds(call: Callable[[], object], wait: Callable[[object], object]) -> float:
-    """Median wall time of a call, the device waited for, after three that warm up."""
-    for _ in range(3):
-        wait(call())
-    times = []
-    for _ in range(_REPEATS):
-        start = time.perf_counter()
-        wait(call())
-        times.append(1e3 * (time.perf_counter() - start))
-    return statistics.median(times)
-
-
-def _ours(splats: Splats, camera: Camera, colors, background, target, config: RenderConfig) -> tuple[dict, np.ndarray]:
-    start = time.perf_counter()
-    plan = plan_render(splats, camera, config=config, slack=1)
-    plan_s = time.perf_counter() - start
-
-    def draw(splats, colors):
-        return render(splats, camera, background=background, colors=colors, plan=plan, config=config).image
-
-    def loss(splats, colors):
-        return jnp.mean(jnp.abs(draw(splats, colors) - target))
-
-    start = time.perf_counter()
-    forward = jax.jit(draw).lower(splats, colors).compile()
-    gradient = jax.jit(jax.value_and_grad(loss, argnums=(0, 1))).lower(splats, colors).compile()
-    row = {
-        "plan_s": plan_s,
-        "compile_s": time.perf_counter() - start,
-        "forward_ms": _milliseconds(lambda: forward(splats, colors), jax.block_until_ready),
-        "gradient_ms": _milliseconds(lambda: gradient(splats, colors), jax.block_until_ready),
-        "program_mb": gradient.memory_analysis().temp_size_in_bytes / 2**20,
-    }
-    return row, np.asarray(forward(splats, colors))
 
 
 def _gsplat(splats: Splats, camera: Camera, colors, background, target) -> tuple[dict, np.ndarray]:
@@ -111,18 +71,18 @@ def _gsplat(splats: Splats, camera: Camera, colors, background, target) -> tuple
 
     def forward():
         with torch.no_grad():
-            return draw()
+            draw()
+        torch.cuda.synchronize()
 
     def gradient():
-        return torch.autograd.grad((draw() - wanted).abs().mean(), lanes)
-
-    def wait(_):
+        torch.autograd.grad((draw() - wanted).abs().mean(), lanes)
         torch.cuda.synchronize()
 
     torch.cuda.reset_peak_memory_stats()
-    row = {"forward_ms": _milliseconds(forward, wait), "gradient_ms": _milliseconds(gradient, wait)}
+    gradient()
+    row = {"forward_wall_ms": measure(forward)[0], "gradient_wall_ms": measure(gradient)[0]}
     row["peak_mb"] = torch.cuda.max_memory_allocated() / 2**20
-    return row, forward().cpu().numpy()
+    return row, draw().detach().cpu().numpy()
 
 
 def main(options: Options) -> None:
@@ -146,11 +106,11 @@ def main(options: Options) -> None:
             print(f"  gsplat left out: {error}", flush=True)
         for tile_size, chunk, block in itertools.product(options.tile_sizes, options.chunks, options.blocks):
             config = RenderConfig(tile_size=tile_size, chunk=chunk, tiles_per_block=block or None)
-            ours, own_image = _ours(splats, camera, colors, background, target, config)
-            row = {"workload": name, "n": splats.count, "width": camera.width, "height": camera.height}
-            row |= {"tile_size": tile_size, "chunk": chunk, "tiles_per_block": block, "ltgs": ours, "gsplat": theirs}
+            row = bench(name, splats, camera, colors, background, target, config=config, reference=False)
+            row |= {"tile_size": tile_size, "chunk": chunk, "tiles_per_block": block, "gsplat": theirs}
             if image is not None:
-                apart = np.abs(own_image - image)
+                own = render(splats, camera, background=background, colors=colors, config=config).image
+                apart = np.abs(np.asarray(own) - image)
                 row |= {"apart_mean": float(apart.mean()), "apart_max": float(apart.max())}
             row |= {"jax": jax.__version__, "device": jax.devices()[0].device_kind}
             rows.append(row)

@@ -71,7 +71,7 @@ def compile_quickly() -> None:
     """Have XLA compile for the CPU by its older emitters: a third less time to compile, a tenth more to run.
 
     Set by name, and only for the release that was measured, since XLA ends a process over a name that it does not know.
-    Has no effect once jax is imported.
+    Has no effect once jax has looked for its devices.
     """
     flag = "--xla_cpu_use_fusion_emitters"
     flags = os.environ.get("XLA_FLAGS", "")

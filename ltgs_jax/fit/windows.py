@@ -1,6 +1,6 @@
 """The parts of photographs that a change touches, and the splats that show there: all that the long fit looks at."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -131,7 +131,9 @@ def within_change(votes: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, " n"]:
     return (votes[:, 0] > _SEEN) & (votes[:, 0] > _INSIDE * votes[:, 1])
 
 
-def _outlines(visits: dict[int, Shown], margin: int):
+def _outlines(
+    visits: dict[int, Shown], margin: int
+) -> Iterator[tuple[int, View | StreamedView, Bool[np.ndarray, "h w"]]]:
     """Visit, photograph and, dilated, where its touched splats would show in it if nothing stood before them."""
     bucket = _bucket(max(int(shown.touched.sum()) for shown in visits.values()))
     scenes = {t: pad_splats(shown.splats[shown.touched], bucket) for t, shown in visits.items()}
