@@ -179,19 +179,38 @@ def _axes(path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float]
     return plt.subplots(rows, columns, figsize=size)
 
 
+_LABEL = 0.045  # height of a name on a plot, in heights of the plot
+
+
 def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) -> str:
-    """A labelled scatter plot with logarithmic time; the Markdown that shows it, or nothing without a point."""
+    """A labelled scatter plot against time, at least a hundredth of the longest; the Markdown that shows it, or nothing
+    without a point."""
     points = [p for p in points if math.isfinite(p[1]) and math.isfinite(p[2]) and p[1] > 0]
+    points = [(name, max(a, 0.01 * max(p[1] for p in points)), b) for name, a, b in points]
     if not points:
         return ""
     figure, axes = _axes(path)
-    for name, a, b in points:
-        axes.plot(a, b, "o", color="tab:brown")
-        axes.annotate(name, (a, b), fontsize=7, xytext=(4, 3), textcoords="offset points")
-    axes.set(xlabel=x, ylabel=y, xscale="log")
-    errors = [b for _, _, b in points]
+    axes.plot([p[1] for p in points], [p[2] for p in points], "o", color="tab:brown")
+    axes.set(xlabel=x, ylabel=y)
+    times = [p[1] for p in points]
+    if max(times) / min(times) > 5:
+        axes.set_xscale("log")
+    errors = [p[2] for p in points]
     if min(errors) > 0 and max(errors) / min(errors) > 30:
         axes.set_yscale("log")
+    elif min(errors) > 0 and max(errors) / min(errors) < 1.1:  # as good as equal, and shown so
+        axes.set_ylim(0.9 * min(errors), 1.1 * max(errors))
+    # Names in a column at the side, none upon another, each tied to its point.
+    axes.set_xlim(axes.get_xlim())
+    axes.set_ylim(axes.get_ylim())
+    places = axes.transAxes.inverted().transform(axes.transData.transform([p[1:] for p in points]))
+    above = 1.0 + _LABEL
+    for i in sorted(range(len(points)), key=lambda i: (-places[i][1].round(2), places[i][0])):
+        above = level = min(places[i][1], above - _LABEL)
+        axes.annotate(
+            points[i][0], points[i][1:], (1.02, level), textcoords="axes fraction", fontsize=7, va="center",
+            arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.5, "shrinkB": 3},
+        )  # fmt: skip
     figure.savefig(path, dpi=80, bbox_inches="tight")
     return f"\n![{y} against {x}](images/{path.name})\n"
 
