@@ -208,7 +208,7 @@ def score_views(point: Point, stage: Stage) -> dict:
         tone = fit_tone(shot.image, eye.image(stage.splats, shot.camera), shot.valid)
         observations.append(dataclasses.replace(shot, image=tone(shot.image)))
     rng = np.random.default_rng([0, 1])
-    options = {"eye": eye, "config": config, "rng": rng, "progress": Silent()}
+    options = {"earlier": lambda t: [], "eye": eye, "config": config, "rng": rng, "progress": Silent()}
     state, accounts, _ = explain_visit(state, 1, observations, front_end, **options)
     changed = [account.template for account in accounts]
     held = [shot for shot, _ in stage.held]

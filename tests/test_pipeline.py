@@ -13,11 +13,12 @@ import pytest
 
 from ltgs_jax import pipeline
 from ltgs_jax.demo import make_capture
+from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
 from ltgs_jax.render import render
-from ltgs_jax.scene import compose
+from ltgs_jax.scene import Splats, Template, compose
 
 _TINY = pipeline.PRESETS["tiny"]
 CONFIG = replace(_TINY, fit=replace(_TINY.fit, long=replace(_TINY.fit.long, passes=2)))
@@ -215,3 +216,41 @@ def test_shreds_are_no_shape_to_hold_against_a_known_object():
     assert shape(box, shreds) == 1
     assert shape(shreds, shreds) == 1
     assert np.isclose(shape(shreds, other), 1 / 3)
+
+
+def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():
+    from ltgs_jax.pipeline.in_place import _stood_so
+    from ltgs_jax.pipeline.looks import Eye, Observation
+    from ltgs_jax.pipeline.state import State, add_template, came_to_place, scene_at, set_from
+
+    rng = np.random.default_rng(3)
+
+    def splats(count: int, half: list[float], middle: list[float], scale: float) -> Splats:
+        colors = rng.uniform(-1.5, 1.5, (count, 1, 3)).astype(np.float32)
+        means = (rng.uniform(-1, 1, (count, 3)) * half + middle).astype(np.float32)
+        return Splats(
+            means,
+            np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+            np.full((count, 3), np.log(scale), np.float32),
+            np.full(count, 3, np.float32),
+            colors,
+        )
+
+    def pose(x: float) -> SE3:
+        return SE3(jnp.asarray([1.0, 0, 0, 0]), jnp.asarray([x, 0.0, 0]))
+
+    state = State.of_initial(splats(300, [2, 2, 0.01], [0, 0, 5], 0.2), np.zeros(300, np.float32), ("a", "b", "c", "d"))
+    state = add_template(state, Template(splats(60, [0.3, 0.3, 0.1], [0, 0, 4], 0.08), 1, 0), np.zeros(60), None, 0)
+    moved = set_from(state, 2, 0, visible=True, pose=pose(0.5))
+    assert [came_to_place(moved, t, 0) for t in range(4)] == [0, 0, 2, 2]
+    away = set_from(moved, 3, 0, visible=False)
+    assert came_to_place(set_from(away, 3, 0, visible=True), 3, 0) == 2
+
+    eye, K = Eye(), jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    camera = Camera(SE3.identity(()), K, 64, 48)
+    shown = eye.image(scene_at(moved, 2)[0], camera)
+    seen = [Observation("c/0.png", camera, shown, np.ones((48, 64), bool))]
+    config = pipeline.PRESETS["fast"]
+    wrong = set_from(state, 2, 0, visible=True, pose=pose(0.35))
+    assert _stood_so(wrong, 2, 0, pose(0.5), seen, eye=eye, config=config)
+    assert not _stood_so(moved, 2, 0, pose(0.35), seen, eye=eye, config=config)

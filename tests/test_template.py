@@ -144,6 +144,10 @@ def test_a_burden_taken_down_parts_from_what_it_stood_on():
     part = taken_down(points, np.where(foot, 0, left), np.where(foot, 1.0, stayed), least=20)
     assert part is not None
     assert np.mean(part == burden) > 0.95
+    cover = (points[:, 2] < 0.05) & (points[:, 2] > 0.04)  # what was below it leaves evidence of both kinds
+    part = taken_down(points, np.where(cover, 1.0, left), np.where(cover, 0.8, stayed), least=20)
+    assert part is not None
+    assert np.mean(part == burden) > 0.95
     assert taken_down(points, np.ones(500), np.zeros(500), least=20) is None  # all of it left
     patches = rng.uniform(size=500) < 0.5  # turned in place: some of it still has its colours
     assert taken_down(points, np.where(patches, 1.0, 0), np.where(patches, 0, 1.0), least=20) is None
@@ -271,6 +275,23 @@ def test_a_template_is_found_where_it_stands_now():
     assert placement.overlap > 0.8
     assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(3)
     assert float(jnp.linalg.norm(placement.world_from_template.xyz - truth.xyz)) < 0.03 * 0.42
+
+
+def test_a_pose_out_of_sight_is_no_better_than_one_in_sight():
+    rng = np.random.default_rng(5)
+    points, _ = _box(rng)
+    wrong = _splats(points, rng.uniform(size=(len(points), 3)), 0.015)  # looks worse than nothing wherever it shows
+    crop = _crop(_splats(points, np.full((len(points), 3), 0.5), 0.015), 40)
+    wall = jnp.where(jnp.arange(40) < 20, 0.5, 50.0)  # the left half of every window is hidden by something close
+    crop = eqx.tree_at(lambda c: c.depth, crop, jnp.broadcast_to(wall, crop.depth.shape))
+    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    poses = pose_hypotheses(points, support, support, np.array([[0.1, 0.1, 0.15]]), turns=2, spread=0.42)
+    _, covered = refiner.score(wrong, poses, crop, tolerance=0.04)
+    options = {"normal": support.normal, "size": 0.42, "tolerance": 0.04}
+    for least, out_of_sight in ((0.0, True), (0.5 * covered.max(), False)):
+        found = refiner.slide(wrong, poses, crop, least=least, rng=np.random.default_rng(0), **options)
+        _, cover = refiner.images(wrong, found, crop, 0.04)
+        assert np.any(np.sum(cover, axis=(1, 2, 3)) < 0.2 * covered.max()) == out_of_sight
 
 
 def test_photographs_agree_on_the_surface_and_not_before_or_behind_it():

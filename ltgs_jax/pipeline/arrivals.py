@@ -1,6 +1,7 @@
 """What came in a visit: known templates at new poses, new objects, or ground that was hidden before."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,7 +14,6 @@ from scipy.spatial import ConvexHull, cKDTree
 from ltgs_jax.detect import dilate
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import Windows, fit_local, template_diameter
-from ltgs_jax.geometry import SE3, rotation_angle
 from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.scene import Splats, Template, pad_splats, transform_splats
 from ltgs_jax.template import (
@@ -24,8 +24,6 @@ from ltgs_jax.template import (
     explained,
     firm_part,
     make_crop,
-    middle_of,
-    place_template,
     search_template,
     settle_template,
     support_below,
@@ -36,10 +34,7 @@ from .ground import ground_shade
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
-_PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
-_BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
-_TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
@@ -103,8 +98,7 @@ def place_arrivals(
         more = _arrivals_of(found, t, observations, after, bared, surface, **tools)
         state, added, _, others = _place_known(state, t, gone, more, observations, after, eye=eye, **tools)
         accounts, rest = accounts + added, rest + others
-    for arrival in rest:
-        new = _as_new(state, t, arrival, observations, evidence, config=config, rng=rng)
+    for arrival, new in rest:
         after, account = _add_new(state, t, arrival, new, config, progress)
         shown = 1.0 if account is None else _shown(after, t, account.template, observations, eye=eye)
         if shown < _SHOWN:
@@ -128,7 +122,7 @@ def _arrivals_of(
             continue
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
-        crop = _crop_around(instance, observations, evidence, config)
+        crop = crop_around(instance, observations, evidence, config)
         arrivals.append(Arrival(instance, support, crop, float(share)))
     return arrivals
 
@@ -145,16 +139,20 @@ def _place_known(
     config: Config,
     rng,
     progress,
-) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[Arrival]]:
-    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest."""
+) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[tuple[Arrival, NewObject | None]]]:
+    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest, each
+    as something new."""
     placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
-    as_new: dict[int, NewObject | None] = {}
+
+    @cache
+    def as_new(i: int) -> NewObject | None:
+        return _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
+
     for (i, k), found in list(placements.items()):
-        if not _convincing(found, config) or found.worth > config.template.tau_sure:
+        if not convincing(found, config) or found.worth > config.template.tau_sure:
             continue
-        if i not in as_new:
-            as_new[i] = _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
-        shape = 1.0 if as_new[i] is None else _same_shape(found, as_new[i], arrivals[i].crop)
+        new = as_new(i)
+        shape = 1.0 if new is None else _same_shape(found, new, arrivals[i].crop)
         if shape < config.template.tau_shape:
             identity = state.chronology.templates[k].identity
             progress.note(f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f}")
@@ -162,7 +160,7 @@ def _place_known(
     accounts, known, rest = [], [], []
     for i, k in _assigned(len(arrivals), placements, config):
         if k is None:
-            rest.append(arrivals[i])
+            rest.append((arrivals[i], as_new(i)))
             continue
         found = placements[i, k]
         state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
@@ -191,106 +189,8 @@ def _beside(
     return rest
 
 
-def turn_in_place(
-    state: State,
-    t: int,
-    gone: dict[int, float],
-    observations: Sequence[Observation],
-    evidence: Evidence,
-    front_end: FrontEnd,
-    *,
-    eye: Eye,
-    config: Config,
-    rng: np.random.Generator,
-    progress,
-) -> tuple[State, list[Account]]:
-    """What seemed to leave, or changed in part, and stands where it stood, turned or nudged: looked for there before
-    anything else, since colours that happen to agree leave only pieces of such a change."""
-    accounts = []
-    for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
-        support, template = state.supports[k], state.chronology.templates[k]
-        if support is None:
-            continue
-        before = state.chronology.world_from_template[t - 1, k]
-        # Without it, whether it seemed to leave or not: its place has to be explained anew.
-        hidden, without = state, evidence
-        if k not in gone:
-            hidden = set_from(state, t, k, visible=False)
-            without = compare(eye, scene_at(hidden, t), observations, front_end, config)
-        shown = scene_at(set_from(hidden, t, k, visible=True, pose=before), t)
-        cover = eye.cover(shown, [k], observations)
-        regions = [dilate(c, 4) & m for c, m in zip(cover, without.masks, strict=True)]
-        views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, without.masks, strict=True))
-        if views == 0:
-            continue
-        points = np.asarray(before.apply(jnp.asarray(template.splats.means)), np.float64)
-        crop = _crop_around(Instance(points, tuple(regions), views), observations, without, config)
-        size = template_diameter(template.splats)
-        search = search_template(
-            template, support, support.moved(before), middle_of(points)[None], crop,
-            size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
-        )  # fmt: skip
-        if search.best_gain < config.template.tau_gain:
-            continue
-        found = settle_template(search, crop, size=size, refiner=eye.refiner)
-        still = place_template(search, before, crop, size=size, refiner=eye.refiner)
-        progress.note(
-            f"visit {t}: object {template.identity} turned or nudged explains {found.gain:.2f}, outline "
-            f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness "
-            f"{found.error:.3f}; as it stood {still.error:.3f}"
-        )
-        if not _convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
-            continue
-        if not _elsewhere(found.world_from_template, before, template, size):
-            continue
-        trial = set_from(hidden, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
-        if _still_changed(trial, t, k, observations, without, front_end, eye=eye, config=config):
-            continue
-        state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
-        progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
-        accounts.append(Account(k, "moved", found.gain, found.error, views))
-    return state, accounts
-
-
-def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
-    """Templates that seemed to leave, and those on or beside which two photographs or more show that a part changed."""
-    scene = scene_at(state, t)
-    for k in range(len(state.chronology.templates)):
-        if k in gone:
-            yield k
-        elif bool(np.asarray(state.chronology.visible)[t, k]):
-            cover = eye.cover(scene, [k], observations)
-            areas = [max(c.sum(), 1) for c in cover]
-            near = [dilate(c, max(1, round(_BESIDE * area**0.5))) for c, area in zip(cover, areas, strict=True)]
-            changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
-            if sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2:
-                yield k
-
-
-def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool:
-    """Whether two poses of a template differ by more than poses are known."""
-    middle = jnp.asarray(middle_of(np.asarray(template.splats.means)), jnp.float32)
-    turn = float(rotation_angle((before.inverse() @ after).quat))
-    shift = np.linalg.norm(np.asarray(after.apply(middle[None]) - before.apply(middle[None])))
-    return bool(turn > _TURNED or shift > _SHIFTED * size)
-
-
-def _still_changed(
-    state: State, t: int, k: int, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
-) -> bool:
-    """Whether a template where it is does not make the change go away.
-
-    The test is detection's own: what the template shows there, against what its splats are expected to leave.
-    """
-    scene = scene_at(state, t)
-    after = compare(eye, scene, observations, front_end, config)
-    cover = eye.cover(scene, [k], observations)
-    was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
-    now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
-    return bool(now > config.template.tau_remains * max(was, 1))
-
-
-def _convincing(found: Placement, config: Config) -> bool:
+def convincing(found: Placement, config: Config) -> bool:
+    """Whether a known template, as placed, is what came."""
     return found.overlap > config.template.tau_outline and found.worth > config.template.tau_same
 
 
@@ -313,7 +213,8 @@ def _window(instance: Instance, observations) -> list[tuple[float, float, float]
     return boxes
 
 
-def _crop_around(instance: Instance, observations, evidence: Evidence, config: Config) -> Crop:
+def crop_around(instance: Instance, observations, evidence: Evidence, config: Config) -> Crop:
+    """Windows of the photographs around an instance, in which other changes do not count."""
     regions = [dilate(region, 2) for region in instance.regions]
     return make_crop(
         [o.camera for o in observations],
@@ -370,7 +271,7 @@ def _placements(
 
 def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:
     """Each arrival with the template it is, or None for a new object: one assignment, best evidence in total."""
-    good = {pair: found.worth for pair, found in placements.items() if _convincing(found, config)}
+    good = {pair: found.worth for pair, found in placements.items() if convincing(found, config)}
     known = sorted({k for _, k in good})
     cost = np.zeros((count, len(known) + count))
     for (i, k), worth in good.items():

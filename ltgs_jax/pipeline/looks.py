@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ltgs_jax.detect import ChangeMap, change_map, similarity
+from ltgs_jax.detect import ChangeMap, change_map, dilate, similarity
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.fit import StreamedView, View
 from ltgs_jax.geometry import Camera, eval_sh
 from ltgs_jax.match import Cone
 from ltgs_jax.render import RenderOutput, RenderPlan, plan_render, render, splat_votes
 from ltgs_jax.scene import Splats, pad_splats
-from ltgs_jax.template import Refiner, Vantage
+from ltgs_jax.template import Refiner, Vantage, unlikeness
 
 from .config import Config
 
@@ -168,6 +168,20 @@ def expected_errors(
         votes += eye.votes(splats, view.camera, np.stack([unlike * view.mask, view.mask], axis=-1))
     # A prior of two pixels that disagree by half: what the photographs hardly showed is not to be relied on.
     return ((votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)).astype(np.float32)
+
+
+def unlike_where_different(
+    images: Sequence[Float[np.ndarray, "h w 3"]], others: Sequence[Float[np.ndarray, "h w 3"]], observations
+) -> tuple[float, float, float]:
+    """Mean unlikeness to the photographs of two renders of each, over the pixels in which they differ; and the share of
+    all pixels that these are."""
+    sums = np.zeros(3)
+    for image, other, o in zip(images, others, observations, strict=True):
+        different = dilate(np.abs(image - other).max(axis=-1) > 0.05, 1) & o.valid
+        both = np.concatenate([unlikeness(shown[None], o.image[None], o.valid[None]) for shown in (image, other)])
+        sums += [*(both * different).sum(axis=(1, 2)), different.sum()]
+    area = sum(o.valid.size for o in observations)
+    return float(sums[0] / max(sums[2], 1)), float(sums[1] / max(sums[2], 1)), float(sums[2] / area)
 
 
 def vantage_of(observations: Sequence[Observation]) -> Vantage:

@@ -89,6 +89,14 @@ def set_from(state: State, t: int, k: int, *, visible: bool, pose: SE3 | None = 
     return eqx.tree_at(lambda s: s.chronology, state, chronology)
 
 
+def came_to_place(state: State, t: int, k: int) -> int:
+    """The visit from which on template k has stood where it stands at visit t; 0 where it always has."""
+    moves = state.chronology.world_from_template
+    poses = np.concatenate([moves.quat, moves.xyz], axis=-1)[: t + 1, k]
+    same = (poses == poses[t]).all(axis=1) & np.asarray(state.chronology.visible)[: t + 1, k]
+    return int(np.flatnonzero(~same).max(initial=-1)) + 1
+
+
 def doubt_template(state: State, k: int, least: Float[np.ndarray, " m"]) -> State:
     """Template k with at least these errors expected of its splats."""
     errors = np.maximum(state.template_errors[k], least).astype(np.float32)

@@ -235,22 +235,35 @@ def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye,
     return unpack_splats("", arrays), arrays["errors"]
 
 
+def _observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observation]:
+    """The photographs of a visit in the light of the first."""
+    observations = []
+    for photograph, view in load_views(run, run.posed(t, "update"), progress):
+        image = view.image.astype(np.float32) / 255
+        tone = fit_tone(image, eye.image(state.chronology.background, view.camera), view.mask)
+        if tone.changed:
+            progress.note(f"{photograph.name}: other light, taken out")
+        observations.append(Observation(photograph.name, view.camera, tone(image), view.mask))
+    return observations
+
+
 def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
     """Explain one visit; its state on disk."""
     config = run.config
 
     def compute():
-        observations = []
-        for photograph, view in load_views(run, run.posed(t, "update"), progress):
-            image = view.image.astype(np.float32) / 255
-            rendered = eye.image(state.chronology.background, view.camera)
-            tone = fit_tone(image, rendered, view.mask)
-            if tone.changed:
-                progress.note(f"{photograph.name}: other light, taken out")
-            observations.append(Observation(photograph.name, view.camera, tone(image), view.mask))
+        observations = _observe(run, state, t, eye, progress)
         rng = np.random.default_rng([run.seed, t])
         after, accounts, masks = explain_visit(
-            state, t, observations, front_end, eye=eye, config=config, rng=rng, progress=progress
+            state,
+            t,
+            observations,
+            front_end,
+            earlier=lambda visit: _observe(run, state, visit, eye, progress),
+            eye=eye,
+            config=config,
+            rng=rng,
+            progress=progress,
         )
         changed = float(np.mean([m.mean() for m in masks])) if masks else 0.0
         counts = {

@@ -1,20 +1,20 @@
 """One visit: what its photographs show that the scene does not, explained by the cheapest account they support."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ltgs_jax.detect import dilate, similarity
 from ltgs_jax.features import FrontEnd
 from ltgs_jax.match import Instance, find_instances
 from ltgs_jax.scene import Template
-from ltgs_jax.template import unlikeness
 
-from .arrivals import place_arrivals, turn_in_place
+from .arrivals import place_arrivals
 from .config import Config
 from .departures import Remnant, take_out
-from .looks import Evidence, Eye, Observation, compare, cone_of
+from .in_place import turn_in_place
+from .looks import Evidence, Eye, Observation, compare, cone_of, unlike_where_different
 from .state import (
     Account,
     State,
@@ -37,12 +37,15 @@ def explain_visit(
     observations: Sequence[Observation],
     front_end: FrontEnd,
     *,
+    earlier: Callable[[int], Sequence[Observation]],
     eye: Eye,
     config: Config,
     rng: np.random.Generator,
     progress,
 ) -> tuple[State, list[Account], list[Bool[np.ndarray, "h w"]]]:
     """The state after visit t, how each object was explained, and the coarse change masks.
+
+    `earlier` gives the photographs of a visit before, should its poses come into question.
 
     First what left: splats whose every view changed. Then, with that taken out and the ground under it filled, what
     came: outlines that meet in space. Each arrival is a known template at a new pose if one explains the photographs,
@@ -66,8 +69,9 @@ def explain_visit(
         if state.chronology.background is background:
             break
     tools = {"eye": eye, "config": config, "rng": rng, "progress": progress}
-    state, turned = turn_in_place(state, t, gone, observations, evidence, front_end, **tools)
-    if turned:
+    state, turned, stood = turn_in_place(state, t, gone, observations, evidence, front_end, earlier=earlier, **tools)
+    gone = {k: share for k, share in gone.items() if k not in stood}
+    if turned or stood:
         scene = scene_at(state, t)
         evidence = compare(eye, scene, observations, front_end, config)
     silhouettes = [
@@ -80,8 +84,8 @@ def explain_visit(
     splats, _, _, guessed = scene
     surface = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.3]
     guesses = [eye.paint(splats, o.camera, guessed[:, None])[..., 0] > 0.5 for o in observations]
-    stood = eye.cover(scene_at(state, t - 1), sorted(gone), observations)
-    bared = [dilate(s, config.detect.dilate) | g for s, g in zip(stood, guesses, strict=True)]
+    left = eye.cover(scene_at(state, t - 1), sorted(gone), observations)
+    bared = [dilate(c, config.detect.dilate) | g for c, g in zip(left, guesses, strict=True)]
     instances = [
         instance
         for instance in find_instances(cones, surface, config=config.match)
@@ -119,7 +123,7 @@ def _put_back(
 
     def judged(alternative: State):
         others = [eye.image(scene_at(alternative, t)[0], o.camera) for o in observations]
-        left, stayed, shown = _unlike_where_different(images, others, observations)
+        left, stayed, shown = unlike_where_different(images, others, observations)
         # What hardly shows either way, under something that came, gives no account of itself.
         hidden = shown < _LEAST_SHOWN * config.template.min_pixels
         return hidden or stayed <= left * (1 + config.template.still_margin), left, stayed, others
@@ -179,17 +183,3 @@ def _learn_errors(
         learned = (mine[:, 0] + usual) / (mine[:, 1] + 1)
         state = doubt_template(state, account.template, np.where(mine[:, 1] > 0.3, learned, 0.0))
     return state
-
-
-def _unlike_where_different(
-    images: Sequence[Float[np.ndarray, "h w 3"]], others: Sequence[Float[np.ndarray, "h w 3"]], observations
-) -> tuple[float, float, float]:
-    """Mean unlikeness to the photographs of two renders of each, over the pixels in which they differ; and the share of
-    all pixels that these are."""
-    sums = np.zeros(3)
-    for image, other, o in zip(images, others, observations, strict=True):
-        different = dilate(np.abs(image - other).max(axis=-1) > 0.05, 1) & o.valid
-        both = np.concatenate([unlikeness(shown[None], o.image[None], o.valid[None]) for shown in (image, other)])
-        sums += [*(both * different).sum(axis=(1, 2)), different.sum()]
-    area = sum(o.valid.size for o in observations)
-    return float(sums[0] / max(sums[2], 1)), float(sums[1] / max(sums[2], 1)), float(sums[2] / area)

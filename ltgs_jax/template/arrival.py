@@ -19,6 +19,7 @@ from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likenes
 from .support import Support, Vantage, fit_support, rotation_about
 
 _TURNS = 12  # in place, of what was found
+_IN_SIGHT = 0.3  # of the pixels that the middle pose covers, from which on a pose is in sight
 _PARALLEL = np.radians(8)  # between the normals of two surfaces, up to which they are taken for parallel
 _LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other than this are taken for one
 _LEANS = np.radians(20)  # from the normal, beyond which something lies on another side
@@ -159,28 +160,35 @@ def search_template(
     """Poses at which a template, rendered at many turns and places on the support, looks like the photographs.
 
     Upright first, and at its pose `before`; unless `upright`, on its other sides too if upright explains little. The
-    best few, unlike each other.
+    best two, best first.
 
     Coarse windows tell the right one of a template's poses, and not one template from another: at half the size even a
-    box where it stands may explain nothing. What the best few explain is measured in the windows themselves.
+    box where it stands may explain nothing, and what is full of detail explains nothing a few degrees beside its pose.
+    What the best two explain is measured in the windows themselves, after some steps of descent.
     """
-    light = thin(template.splats, config.search_splats)
+    light, lighter = (thin(template.splats, count) for count in (config.search_splats, config.search_splats // 2))
     points = _shown_points(light)
     coarse = half_crop(crop)
     without, change = backdrop_error(crop)
+    options = {"tolerance": 0.1 * size}
     best: Search | None = None
     for tilts, turns in (([np.eye(3)], config.yaw_steps), (tilts_of(stood_on), config.yaw_steps // 2)):
         hypotheses = pose_hypotheses(points, stood_on, stands_on, places, turns=turns, spread=size, tilts=tilts)
         if before is not None:
             hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
-        scores = refiner.score(light, hypotheses, coarse, tolerance=0.1 * size)
+        scores, covered = refiner.score(lighter, hypotheses, coarse, **options)
+        # Behind what is known no pose is wrong, and none is right.
+        least = _IN_SIGHT * np.median(covered)
+        scores = np.where(covered < least, np.inf, scores)
         chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
         poses = refiner.slide(
-            light, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, tolerance=0.1 * size, rng=rng
+            lighter, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, least=least, rng=rng, **options
         )
-        errors = refiner.score(light, poses, crop, tolerance=0.1 * size)
-        order = np.argsort(errors, kind="stable")
-        found = Search(light, stood_on, stands_on, poses[order], errors[order], without, change)
+        errors, _ = refiner.score(light, poses, crop, **options)
+        two = poses[np.argsort(errors, kind="stable")[:2]]
+        near = refiner.refine(light, two, crop, size=size, steps=6, blurred=3, **options)
+        order = np.argsort(near.errors, kind="stable")
+        found = Search(light, stood_on, stands_on, near.poses[order], near.errors[order], without, change)
         if best is None or found.errors.min() < best.errors.min():
             best = found
         if upright or best.best_gain > config.tau_search:
@@ -198,7 +206,7 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     found = refiner.refine(search.template, search.poses[:2], crop, steps=12, **options)
     best = int(np.argmin(found.errors))
     turned = turned_round(found.poses[best], search.template, search.stands_on.normal, _TURNS)[1:]
-    scores = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
+    scores, _ = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
     other = refiner.refine(search.template, turned[np.argsort(scores, kind="stable")[:2]], crop, steps=8, **options)
     pose, error = found.poses[best], found.errors[best]
     if other.errors.min() < error:

@@ -31,14 +31,14 @@ class TemplateConfig:
     """Relative unlikeness that an account must save before something that left is not taken to be still there."""
     yaw_steps: int = 16
     """Turns about the support's normal tried for a known template."""
-    starts: int = 6
-    """Poses, unlike each other, that are followed further."""
+    starts: int = 32
+    """Poses, unlike each other, that are followed further, fewer from round to round."""
     window: int = 56
     """Pixels along the edge of the windows in which poses are compared."""
     candidates: int = 2
     """Known templates, best by points, whose pose is refined for one arrival."""
     search_splats: int = 1024
-    """Splats of a template while its pose is sought."""
+    """Splats of a template while its pose is sought; half of them in small windows."""
     tau_search: float = 0.25
     """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
     tau_gain: float = 0.02

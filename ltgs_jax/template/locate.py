@@ -123,6 +123,7 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
 
 
 _FEW, _BATCH = 14, 64  # poses rendered in one call: of a descent (two with their probes), of a search
+_BEAM = ((32, 4), (16, 8), (8, 8), (6, 10), (6, 10), (6, 10))  # poses that a search follows, and steps around each
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
@@ -292,14 +293,17 @@ class Refiner:
                 max(plan.intersections, needed.intersections) * 3 // 2, max(plan.rounds, needed.rounds) * 3 // 2
             )
 
-    def score(self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float) -> Float[np.ndarray, " m"]:
-        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`."""
+    def score(
+        self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float
+    ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`, and the pixels it covers there."""
         m = poses.xyz.shape[0]
-        errors = []
+        errors, covered = [], []
         for start in range(0, m, _BATCH):
-            images, _ = self.images(template, poses[start : start + _BATCH], crop, tolerance)
+            images, cover = self.images(template, poses[start : start + _BATCH], crop, tolerance)
             errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
-        return np.concatenate(errors)
+            covered.append(np.sum(cover * np.asarray(crop.valid), axis=(1, 2, 3)))
+        return np.concatenate(errors), np.concatenate(covered)
 
     def slide(
         self,
@@ -310,31 +314,33 @@ class Refiner:
         normal: Float[np.ndarray, "3"],
         size: float,
         tolerance: float,
+        least: float,
         rng: np.random.Generator,
-        rounds: int = 6,
     ) -> SE3:
-        """Each of m poses moved over the surface of unit `normal` and turned about it, to where it is least unlike the
-        photographs: in every round the best of random steps around it, steps shrinking.
+        """Each of m poses, best first, moved over the surface of unit `normal` and turned about it, to where it is
+        least unlike the photographs: in every round of `_BEAM` the best of random steps around each, steps shrinking,
+        and fewer poses followed. Where the template covers fewer than `least` pixels nothing can be said of a pose.
 
         Two in-plane shifts and a turn: the other three freedoms would let a wrong pose sink or tilt to please.
         """
-        m = poses.xyz.shape[0]
         center = np.asarray(_middle(template).xyz, np.float64)
         axes = np.linalg.svd(normal[None])[2][1:]
         best = np.asarray(poses.as_matrix(), np.float64)
-        tries = _BATCH // m
-        for r in range(rounds):
-            steps = rng.normal(size=(m, tries, 3)) * np.array([0.25 * size, 0.25 * size, 0.35]) * 0.65**r
+        for r, (kept, tries) in enumerate(_BEAM):
+            best = best[:kept]
+            steps = rng.normal(size=(len(best), tries, 3)) * np.array([0.25 * size, 0.25 * size, 0.35]) * 0.65**r
             steps[:, 0] = 0
             trial = np.stack(
                 [
-                    [_slid(best[i], center, steps[i, j, :2] @ axes, normal, steps[i, j, 2]) for j in range(tries)]
-                    for i in range(m)
+                    [_slid(pose, center, step[:2] @ axes, normal, step[2]) for step in around]
+                    for pose, around in zip(best, steps, strict=True)
                 ]
             )
             flat = SE3.from_matrix(jnp.asarray(trial.reshape(-1, 4, 4), jnp.float32))
-            errors = self.score(template, flat, crop, tolerance=tolerance).reshape(m, tries)
-            best = trial[np.arange(m), errors.argmin(axis=1)]
+            errors, covered = self.score(template, flat, crop, tolerance=tolerance)
+            errors = np.where(covered < least, np.inf, errors).reshape(trial.shape[:2])
+            order = np.argsort(errors.min(axis=1), kind="stable")
+            best = trial[order, errors.argmin(axis=1)[order]]
         return SE3.from_matrix(jnp.asarray(best, jnp.float32))
 
     def refine(

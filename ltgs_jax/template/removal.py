@@ -58,23 +58,28 @@ def taken_down(
     """The splats of what was taken down from upon the rest; None where the evidence does not part at a level, where the
     outline does not step there, or where either side has less than `least` pixels of evidence.
 
-    `points`: their centres along two axes of the support and its normal. The level is the one, at or below that which
-    parts the evidence best, at which the outline grows most: the foot of what was taken down tells little.
+    `points`: their centres along two axes of the support and its normal. The level is the one at which the outline
+    grows most, of those that part the evidence and those below: the foot of what was taken down tells little.
     """
     height = points[:, 2]
     levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
+
+    def parts(level: float) -> bool:
+        upper = height > level
+        told = left[upper].sum() > least and stayed[~upper].sum() > least
+        off, low = share_of(left[upper], stayed[upper]), share_of(left[~upper], stayed[~upper])
+        return told and off > _OFF and low < config.whole
+
     net = left - stayed
     best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
-    upper = height > levels[best]
-    told = left[upper].sum() > least and stayed[~upper].sum() > least
-    parted = share_of(left[upper], stayed[upper]) > _OFF and share_of(left[~upper], stayed[~upper]) < config.whole
-    if not (told and parted):
+    if not parts(levels[best]):
         return None
     thick = 0.1 * np.ptp(height)
+    levels = [level for i, level in enumerate(levels) if i <= best or parts(level)]
     growth = [
         _extent(points[(height > level - thick) & (height <= level)])
         / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
-        for level in levels[: best + 1]
+        for level in levels
     ]
     step = int(np.argmax(growth))
     return height > levels[step] if growth[step] > _STEP else None

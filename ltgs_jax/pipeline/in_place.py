@@ -1,0 +1,147 @@
+"""What changed and stands where it stood: turned or nudged, or put at the wrong pose by a visit before."""
+
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from ltgs_jax.detect import dilate
+from ltgs_jax.features import FrontEnd
+from ltgs_jax.fit import template_diameter
+from ltgs_jax.geometry import SE3, rotation_angle
+from ltgs_jax.match import Instance
+from ltgs_jax.scene import Template
+from ltgs_jax.template import middle_of, place_template, search_template, settle_template
+
+from .arrivals import convincing, crop_around
+from .config import Config
+from .looks import Evidence, Eye, Observation, compare, unlike_where_different
+from .state import Account, State, came_to_place, scene_at, set_from
+
+_PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
+_BESIDE = 0.15  # width of what is beside it, in sides of a square as large
+_TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
+
+
+def turn_in_place(
+    state: State,
+    t: int,
+    gone: dict[int, float],
+    observations: Sequence[Observation],
+    evidence: Evidence,
+    front_end: FrontEnd,
+    *,
+    earlier: Callable[[int], Sequence[Observation]],
+    eye: Eye,
+    config: Config,
+    rng: np.random.Generator,
+    progress,
+) -> tuple[State, list[Account], list[int]]:
+    """What seemed to leave, or changed in part, and stands where it stood, turned or nudged: looked for there before
+    anything else, since colours that happen to agree leave only pieces of such a change.
+
+    An account of each; and the templates that did not move at all: the photographs of the visit that put them there
+    (`earlier`) like the pose found now as well, which is theirs from that visit on.
+    """
+    accounts, stood = [], []
+    for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
+        support, template = state.supports[k], state.chronology.templates[k]
+        if support is None:
+            continue
+        before = state.chronology.world_from_template[t - 1, k]
+        # Without it, whether it seemed to leave or not: its place has to be explained anew.
+        hidden, without = state, evidence
+        if k not in gone:
+            hidden = set_from(state, t, k, visible=False)
+            without = compare(eye, scene_at(hidden, t), observations, front_end, config)
+        shown = scene_at(set_from(hidden, t, k, visible=True, pose=before), t)
+        cover = eye.cover(shown, [k], observations)
+        regions = [dilate(c, 4) & m for c, m in zip(cover, without.masks, strict=True)]
+        views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, without.masks, strict=True))
+        if views == 0:
+            continue
+        points = np.asarray(before.apply(jnp.asarray(template.splats.means)), np.float64)
+        crop = crop_around(Instance(points, tuple(regions), views), observations, without, config)
+        size = template_diameter(template.splats)
+        search = search_template(
+            template, support, support.moved(before), middle_of(points)[None], crop,
+            size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
+        )  # fmt: skip
+        if search.best_gain < config.template.tau_gain:
+            continue
+        found = settle_template(search, crop, size=size, refiner=eye.refiner)
+        still = place_template(search, before, crop, size=size, refiner=eye.refiner)
+        progress.note(
+            f"visit {t}: object {template.identity} turned or nudged explains {found.gain:.2f}, outline "
+            f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness "
+            f"{found.error:.3f}; as it stood {still.error:.3f}"
+        )
+        if not convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
+            continue
+        pose = found.world_from_template
+        if not _elsewhere(pose, before, template, size):
+            continue
+        trial = set_from(hidden, t, k, visible=True, pose=pose, unsure=config.detect.moved)
+        if _still_changed(trial, t, k, observations, without, front_end, eye=eye, config=config):
+            continue
+        since = came_to_place(state, t - 1, k)
+        if since > 0 and _stood_so(state, since, k, pose, earlier(since), eye=eye, config=config):
+            progress.note(
+                f"visit {t}: object {template.identity} did not move: visit {since} likes its pose of now too"
+            )
+            state = set_from(state, since, k, visible=True, pose=pose, unsure=config.detect.moved)
+            stood.append(k)
+            continue
+        state = set_from(state, t, k, visible=True, pose=pose, unsure=config.detect.moved)
+        progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
+        accounts.append(Account(k, "moved", found.gain, found.error, views))
+    return state, accounts, stood
+
+
+def _stood_so(
+    state: State, t: int, k: int, pose: SE3, observations: Sequence[Observation], *, eye: Eye, config: Config
+) -> bool:
+    """Whether the photographs of visit t like template k at another pose as well as at its own: one pose for two visits
+    is cheaper than two."""
+    scenes = (scene_at(s, t)[0] for s in (state, set_from(state, t, k, visible=True, pose=pose)))
+    images, others = ([eye.image(splats, o.camera) for o in observations] for splats in scenes)
+    own, other, _ = unlike_where_different(images, others, observations)
+    return other <= own * (1 + config.template.still_margin)
+
+
+def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
+    """Templates that seemed to leave, and those on or beside which two photographs or more show that a part changed."""
+    scene = scene_at(state, t)
+    for k in range(len(state.chronology.templates)):
+        if k in gone:
+            yield k
+        elif bool(np.asarray(state.chronology.visible)[t, k]):
+            cover = eye.cover(scene, [k], observations)
+            areas = [max(c.sum(), 1) for c in cover]
+            near = [dilate(c, max(1, round(_BESIDE * area**0.5))) for c, area in zip(cover, areas, strict=True)]
+            changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
+            if sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2:
+                yield k
+
+
+def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool:
+    """Whether two poses of a template differ by more than poses are known."""
+    middle = jnp.asarray(middle_of(np.asarray(template.splats.means)), jnp.float32)
+    turn = float(rotation_angle((before.inverse() @ after).quat))
+    shift = np.linalg.norm(np.asarray(after.apply(middle[None]) - before.apply(middle[None])))
+    return bool(turn > _TURNED or shift > _SHIFTED * size)
+
+
+def _still_changed(
+    state: State, t: int, k: int, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
+) -> bool:
+    """Whether a template where it is does not make the change go away.
+
+    The test is detection's own: what the template shows there, against what its splats are expected to leave.
+    """
+    scene = scene_at(state, t)
+    after = compare(eye, scene, observations, front_end, config)
+    cover = eye.cover(scene, [k], observations)
+    was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
+    now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
+    return bool(now > config.template.tau_remains * max(was, 1))
