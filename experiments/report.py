@@ -186,9 +186,10 @@ def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) 
     """A labelled scatter plot against time, at least a hundredth of the longest; the Markdown that shows it, or nothing
     without a point."""
     points = [p for p in points if math.isfinite(p[1]) and math.isfinite(p[2]) and p[1] > 0]
-    points = [(name, max(a, 0.01 * max(p[1] for p in points)), b) for name, a, b in points]
     if not points:
         return ""
+    least = 0.01 * max(p[1] for p in points)
+    points = [(name, max(a, least), b) for name, a, b in points]
     figure, axes = _axes(path)
     axes.plot([p[1] for p in points], [p[2] for p in points], "o", color="tab:brown")
     axes.set(xlabel=x, ylabel=y)

@@ -4,7 +4,7 @@ import dataclasses
 import os
 import platform
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol
@@ -259,7 +259,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
             t,
             observations,
             front_end,
-            earlier=lambda visit: _observe(run, state, visit, eye, progress),
+            earlier=cache(lambda visit: _observe(run, state, visit, eye, progress)),  # decoded once for all objects
             eye=eye,
             config=config,
             rng=rng,

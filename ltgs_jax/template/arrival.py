@@ -198,12 +198,12 @@ def search_template(
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """Refine the best two poses of a search on the pixels, in all six freedoms, then the best two turns in place of
+    """Refine the poses of a search on the pixels, in all six freedoms, then the best two turns in place of
     what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell.
     It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
     options = {"size": size, "tolerance": 0.1 * size, "blurred": 3}
-    found = refiner.refine(search.template, search.poses[:2], crop, steps=12, **options)
+    found = refiner.refine(search.template, search.poses, crop, steps=12, **options)
     best = int(np.argmin(found.errors))
     turned = turned_round(found.poses[best], search.template, search.stands_on.normal, _TURNS)[1:]
     scores, _ = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
@@ -266,9 +266,9 @@ def _unlike(
     order = np.argsort(scores, kind="stable")
     chosen: list[int] = []
     for i in order:
-        turned = [2 * np.arccos(np.clip(abs(quat[i] @ quat[j]), 0, 1)) for j in chosen]
-        moved = [np.linalg.norm(xyz[i] - xyz[j]) for j in chosen]
-        if all(a > angle or d > distance for a, d in zip(turned, moved, strict=True)):
+        turned = 2 * np.arccos(np.clip(np.abs(quat[chosen] @ quat[i]), 0, 1))
+        moved = np.linalg.norm(xyz[chosen] - xyz[i], axis=1)
+        if np.all((turned > angle) | (moved > distance)):
             chosen.append(int(i))
         if len(chosen) == count:
             break
