@@ -207,6 +207,7 @@ def _share_programs(folder: Path) -> None:
     import jax
 
     jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # hundreds of small programs add up
 
 
 def _on_cluster(runs: list[Run], out: Path, address: str, retry: bool, tell: Callable[[Run, dict], None]) -> None:

@@ -24,6 +24,7 @@ from ltgs_jax.template import (
 from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
+from ltgs_jax.template.locate import freedoms_of
 from ltgs_jax.template.removal import gone_evidence, taken_down
 
 
@@ -275,6 +276,55 @@ def test_a_template_is_found_where_it_stands_now():
     assert placement.overlap > 0.8
     assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(3)
     assert float(jnp.linalg.norm(placement.world_from_template.xyz - truth.xyz)) < 0.03 * 0.42
+
+
+def _turned(angle: float, xyz) -> SE3:
+    """A turn about the vertical through the origin, then a shift."""
+    return SE3(jnp.asarray([np.cos(angle / 2), 0, 0, np.sin(angle / 2)], jnp.float32), jnp.asarray(xyz, jnp.float32))
+
+
+def test_polish_ends_where_the_unlikeness_is_least():
+    points, colors = _box(np.random.default_rng(5))
+    splats = _splats(points, colors, 0.015)
+    truth = _turned(0.4, [0.1, 0.08, 0])
+    crop = _crop(eqx.tree_at(lambda s: s.means, splats, truth.apply(splats.means)), 40)
+    begin = _turned(0.44, [0.108, 0.074, 0])
+    freedoms = freedoms_of(None) * np.r_[np.full(3, 0.01), np.full(3, 0.04)][:, None]
+    refiner = Refiner()
+    before, _ = refiner.score(splats, begin[None], crop, tolerance=0.04)
+    found = refiner.polish(splats, begin[None], crop, freedoms, tolerance=0.04, rounds=6)
+    assert found.errors[0] < 0.3 * before[0]
+    error = found.poses[0].inverse() @ truth
+    assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(1)
+    # What may not change does not.
+    along = np.eye(6)[:, :1] * 0.01
+    kept = refiner.polish(splats, begin[None], crop, along, tolerance=0.04, rounds=3)
+    np.testing.assert_allclose(kept.poses.quat[0], begin.quat, atol=1e-5)
+    assert found.errors[0] <= kept.errors[0] <= before[0]
+
+
+def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
+    rng = np.random.default_rng(8)
+    around, up = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(0, 0.2, 3000)
+    wall = np.stack([0.1 * np.cos(around), 0.1 * np.sin(around), up], axis=-1)
+    handle = rng.uniform([0.1, -0.012, 0.05], [0.16, 0.012, 0.15], (400, 3))
+    points = np.concatenate([wall, handle])
+    lit = 0.7 + 0.25 * np.sin(around)  # of the side where the light is
+    bands = np.array([0.9, 0.3, 0.3, 0.9, 0.9, 0.9, 0.3, 0.3])[(around * 4 / np.pi).astype(int)]  # the print
+    grey = np.full((400, 3), 0.4)
+    colors = np.concatenate([np.tile((lit * bands)[:, None], 3), grey])
+    template = Template(_splats(points, colors, 0.008), 1, 0)
+    truth = _turned(np.pi, [0.12, 0.07, 0.0])
+    # The light stays where it is: what was the bright side is the dark one now.
+    now = np.concatenate([np.tile(((1.4 - lit) * bands)[:, None], 3), grey])
+    shown = _splats(np.asarray(truth.apply(template.splats.means)), now, 0.008)
+    crop = _crop(shown, 56)
+    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    wrong = _turned(0.0, [0.12, 0.07, 0.0])
+    search = Search(template.splats, support, support, wrong[None], np.zeros(1), 1.0, 1.0)
+    found = settle_template(search, crop, size=0.4, refiner=refiner)
+    error = found.world_from_template.inverse() @ truth
+    assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(15)
 
 
 def test_a_pose_out_of_sight_is_no_better_than_one_in_sight():

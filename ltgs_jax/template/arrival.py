@@ -15,10 +15,24 @@ from ltgs_jax.scene import Splats, Template, pad_splats
 
 from .config import TemplateConfig
 from .consistency import surface_evidence
-from .locate import Crop, Refiner, backdrop_error, explained, half_crop, likeness, overlap_of, recall_of, turned_round
+from .locate import (
+    Crop,
+    Refiner,
+    backdrop_error,
+    explained,
+    freedoms_of,
+    half_crop,
+    likeness,
+    overlap_of,
+    recall_of,
+    turned_round,
+)
 from .support import Support, Vantage, fit_support, rotation_about
 
 _TURNS = 12  # in place, of what was found
+_ASIDE = 0.1  # of an object's size: half as far as a turn is tried to the sides of its place
+_WIDTH = np.r_[np.full(3, 0.02), np.full(3, 0.04)]  # in sizes and radians: where a pose is polished at first
+_ROUNDS = 6  # of polish
 _IN_SIGHT = 0.3  # of the pixels that the middle pose covers, from which on a pose is in sight
 _PARALLEL = np.radians(8)  # between the normals of two surfaces, up to which they are taken for parallel
 _LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other than this are taken for one
@@ -198,26 +212,53 @@ def search_template(
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """Refine the poses of a search on the pixels, in all six freedoms, then the best two turns in place of
-    what comes of it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell.
-    It stands upright, as it stood, unless the pixels clearly say that it leans.
+    """Refine the poses of a search on the pixels, in all six freedoms, and the two best turns in place of what comes of
+    it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. Of the four the one
+    with the most evidence, not the least error: shade weighs as much as detail in the error, and it stays where it is
+    when an object turns. It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
-    options = {"size": size, "tolerance": 0.1 * size, "blurred": 3}
-    found = refiner.refine(search.template, search.poses, crop, steps=12, **options)
-    best = int(np.argmin(found.errors))
-    turned = turned_round(found.poses[best], search.template, search.stands_on.normal, _TURNS)[1:]
-    scores, _ = refiner.score(search.template, turned, crop, tolerance=0.1 * size)
-    other = refiner.refine(search.template, turned[np.argsort(scores, kind="stable")[:2]], crop, steps=8, **options)
-    pose, error = found.poses[best], found.errors[best]
-    if other.errors.min() < error:
-        pose, error = other.poses[int(np.argmin(other.errors))], other.errors.min()
-    upright = levelled(pose, search)
-    if upright is not None:
-        turning = search.stood_on.normal
-        level = refiner.refine(search.template, upright[None], crop, steps=12, turning=turning, **options)
-        if level.errors[0] < error * (1 + _LEVEL_MARGIN):
-            pose = level.poses[0]
+    found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=0.1 * size, steps=12, blurred=3)
+    first = found.poses[int(np.argmin(found.errors))]
+    turned = _other_turns(search, first, crop, size=size, refiner=refiner)
+    placed = [
+        place_template(search, _polished(search, pose, None, crop, size, refiner)[0], crop, size=size, refiner=refiner)
+        for pose in (first, turned[0], turned[1])
+    ]
+    best = max(placed, key=lambda p: (p.worth, -p.error))
+    upright = levelled(best.world_from_template, search)
+    if upright is None:
+        return best
+    pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner)
+    if error > best.error * (1 + _LEVEL_MARGIN):
+        return best
     return place_template(search, pose, crop, size=size, refiner=refiner)
+
+
+def _polished(search: Search, pose: SE3, turning, crop: Crop, size: float, refiner: Refiner) -> tuple[SE3, float]:
+    """A pose [] where the unlikeness is least nearby, and that."""
+    freedoms = freedoms_of(turning) * (_WIDTH * np.r_[np.full(3, size), np.ones(3)])[:, None]
+    found = refiner.polish(search.template, pose[None], crop, freedoms, tolerance=0.1 * size, rounds=_ROUNDS)
+    return found.poses[0], float(found.errors[0])
+
+
+def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> SE3:
+    """The two best other turns of a pose about the surface's normal that are better than those next to them, each where
+    it fits best: what is to one side of an object's axis, as a handle, is to the other when it has turned.
+    """
+    tolerance, axes = 0.1 * size, search.stands_on.frame()
+    turns = turned_round(pose, search.template, search.stands_on.normal, _TURNS)
+    ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
+    shifts = 2 * _ASIDE * size * np.stack([np.zeros(3), *ring])
+    places = (np.asarray(turns.xyz)[:, None] + shifts).reshape(-1, 3)
+    every = SE3(jnp.repeat(turns.quat, len(shifts), axis=0), jnp.asarray(places, jnp.float32))
+    errors = refiner.score(search.template, every, crop, tolerance=tolerance)[0].reshape(_TURNS, -1)
+    nearest = every[np.arange(_TURNS) * len(shifts) + errors.argmin(axis=1)]
+    along = np.zeros((6, 2))
+    along[:3] = _ASIDE * size * search.stood_on.frame()[:2].T
+    fitted = refiner.polish(search.template, nearest, crop, along, tolerance=tolerance, rounds=3)
+    least = fitted.errors
+    dips = (least <= np.roll(least, 1)) & (least <= np.roll(least, -1))
+    return fitted.poses[1 + np.argsort(np.where(dips, least, least + 1)[1:], kind="stable")[:2]]
 
 
 def _shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:

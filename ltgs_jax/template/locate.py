@@ -127,6 +127,7 @@ _BEAM = ((32, 4), (16, 8), (8, 8), (6, 10), (6, 10), (6, 10))  # poses that a se
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
+_NARROWER = 0.7  # what is left of the width of parabolas from round to round
 
 
 @eqx.filter_jit
@@ -368,16 +369,11 @@ class Refiner:
         damping = np.full(m, 1e-2)
         best = jax.tree.map(np.asarray, poses)
         best_cost, best_errors = np.full(m, np.inf), np.full(m, np.inf)
-        # Columns: the freedoms as tangents.
-        freedoms = np.eye(6) if turning is None else np.c_[np.eye(6)[:, :3], np.r_[np.zeros(3), turning]]
+        freedoms = freedoms_of(turning)
         normal = np.zeros((m, 6, 6))
         slope = np.zeros((m, 6))
         trial = poses
         middle = _middle(template)
-
-        def moved(poses: SE3, tangents: np.ndarray) -> SE3:
-            # About the template's middle: about a far origin, turns and shifts would be one and the same.
-            return poses @ middle @ SE3.exp(jnp.asarray(tangents, jnp.float32)) @ middle.inverse()
 
         valid = np.asarray(crop.valid)[None, None, ..., None]
         target = np.asarray(crop.target)
@@ -386,7 +382,7 @@ class Refiner:
                 best_cost[:] = np.inf
             blur = 1.5 if step < blurred else 0.0
             spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), 7, axis=0), trial)
-            spread = moved(spread, np.tile(probes, (m, 1)))
+            spread = _about(middle, spread, np.tile(probes, (m, 1)))
             images, _ = self.images(template, spread, crop, tolerance)
             images = images.reshape(m, 7, *images.shape[1:])
             errors = _view_errors(_unlike_crop(images[:, 0], crop), crop).mean(axis=1)
@@ -409,11 +405,7 @@ class Refiner:
             normal = np.where(better[:, None, None], new_normal, normal)
             slope = np.where(better[:, None], new_slope, slope)
             damping = np.where(better, np.maximum(damping / 4, 1e-4), damping * 6)
-            best = jax.tree.map(
-                lambda new, old, b=better: np.where(b.reshape(-1, *(1,) * (old.ndim - 1)), np.asarray(new), old),
-                trial,
-                best,
-            )
+            best = _where(better, jax.tree.map(np.asarray, trial), best)
             best_cost, best_errors = np.where(better, cost, best_cost), np.where(better, errors, best_errors)
             scale = np.einsum("mii->mi", normal)
             scale = scale + 1e-9 * scale.max(axis=1, keepdims=True) + 1e-12
@@ -423,5 +415,57 @@ class Refiner:
             # No step leaves the region in which a linearisation of pixels can mean anything.
             move[:, :3] = np.clip(move[:, :3], -0.15 * size, 0.15 * size)
             move[:, 3:] = np.clip(move[:, 3:], -0.3, 0.3)
-            trial = moved(jax.tree.map(jnp.asarray, best), move)
+            trial = _about(middle, jax.tree.map(jnp.asarray, best), move)
         return Refinement(jax.tree.map(jnp.asarray, best), best_errors)
+
+    def polish(
+        self,
+        template: Splats,
+        poses: SE3,
+        crop: Crop,
+        freedoms: Float[np.ndarray, "6 k"],
+        *,
+        tolerance: float,
+        rounds: int,
+    ) -> Refinement:
+        """Each of m poses moved to where the unlikeness itself is least: the residuals of a descent also pull towards
+        where the shade of a template agrees. `freedoms`: what may change, tangents as wide as the first round looks.
+
+        A round takes the unlikeness on both sides along each freedom and goes to the vertices of the parabolas; each
+        round looks less wide.
+        """
+        middle, count = _middle(template), freedoms.shape[1]
+        probes = np.concatenate([np.zeros((1, 6)), freedoms.T, -freedoms.T])
+        m, each = poses.xyz.shape[0], np.arange(poses.xyz.shape[0])
+        center = best = jax.tree.map(np.asarray, poses)
+        best_errors = np.full(m, np.inf)
+        for width in _NARROWER ** np.arange(rounds):
+            around = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), len(probes), axis=0), center)
+            around = _about(middle, around, np.tile(width * probes, (m, 1)))
+            errors = self.score(template, around, crop, tolerance=tolerance)[0].reshape(m, -1)
+            lost, least = errors[:, 0] > best_errors, errors.argmin(axis=1)
+            better = errors[each, least] < best_errors
+            best = _where(better, jax.tree.map(np.asarray, around[each * len(probes) + least]), best)
+            best_errors = np.where(better, errors[each, least], best_errors)
+            ahead, behind = errors[:, 1 : 1 + count], errors[:, 1 + count :]
+            bend = np.maximum(ahead + behind - 2 * errors[:, :1], 1e-9)
+            vertex = width * np.clip((behind - ahead) / 2 / bend, -1.5, 1.5) @ freedoms.T
+            moved = _about(middle, jax.tree.map(jnp.asarray, center), vertex)
+            center = _where(lost, best, jax.tree.map(np.asarray, moved))
+        return Refinement(jax.tree.map(jnp.asarray, best), best_errors)
+
+
+def _about(middle: SE3, poses: SE3, tangents: Float[np.ndarray, "m 6"]) -> SE3:
+    """Poses moved in the template's frame about its middle: about a far origin, turns and shifts would be one and the
+    same."""
+    return poses @ middle @ SE3.exp(jnp.asarray(tangents, jnp.float32)) @ middle.inverse()
+
+
+def freedoms_of(turning: Float[np.ndarray, "3"] | None) -> Float[np.ndarray, "6 k"]:
+    """What may change of a pose, as columns of tangents: all, or the place and the turn about one axis."""
+    return np.eye(6) if turning is None else np.c_[np.eye(6)[:, :3], np.r_[np.zeros(3), turning]]
+
+
+def _where(chosen: Bool[np.ndarray, " m"], these: SE3, others: SE3) -> SE3:
+    """Of two batches of poses, row by row the one or the other."""
+    return jax.tree.map(lambda a, b: np.where(chosen.reshape(-1, *(1,) * (a.ndim - 1)), a, b), these, others)
