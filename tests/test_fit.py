@@ -1,5 +1,7 @@
 """Growth at fixed capacity, the initial fit, the long fit, the local fit."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,8 +22,9 @@ from ltgs_jax.fit import (
 )
 from ltgs_jax.fit.chronology import placements_of
 from ltgs_jax.fit.growth import faint, recycle
+from ltgs_jax.fit.optimizer import Rates
 from ltgs_jax.fit.windows import cover_region, crop_camera
-from ltgs_jax.geometry import SE3, Camera, stack_cameras
+from ltgs_jax.geometry import C0, SE3, Camera, stack_cameras
 from ltgs_jax.render import render
 from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats
 
@@ -162,6 +165,41 @@ def test_long_fit_changes_nothing_far_from_what_changed():
     again, _ = fit_chronology(off, views, key=jax.random.key(0), config=LongConfig(passes=3))
     for a, b in zip(jax.tree.leaves(fitted), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def _lit(splats: Splats, shade) -> np.ndarray:
+    """Log of the gain that a shade puts on splats, from its definition."""
+    return np.asarray(shade[0] + np.asarray(splats.means) @ np.asarray(shade[1:]))
+
+
+def test_a_shade_is_a_gain_on_every_colour():
+    truth, _ = _moved_chronology(0.0)
+    shade = jnp.zeros((2, 1, 4)).at[1, 0].set(jnp.asarray([0.1, 0.5, -0.3, 0.2]))
+    lit = eqx.tree_at(lambda c: c.shade, truth, shade, is_leaf=lambda leaf: leaf is None)
+    item = truth.templates[0].splats
+    colours = [C0 * np.asarray(compose(c, 1).sh)[-item.count :, 0] + 0.5 for c in (truth, lit)]
+    np.testing.assert_allclose(colours[1], np.exp(_lit(item, shade[1, 0]))[:, None] * colours[0], rtol=1e-5)
+    for a, b in zip(jax.tree.leaves(compose(truth, 0)), jax.tree.leaves(compose(lit, 0)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_long_fit_finds_how_an_object_is_lit_where_it_stands_now():
+    unlit, _ = _moved_chronology(0.0)
+    shade = jnp.zeros((2, 1, 4)).at[1, 0].set(jnp.asarray([-0.3, 0.5, 0.0, 0.0]))
+    truth = eqx.tree_at(lambda c: c.shade, unlit, shade, is_leaf=lambda leaf: leaf is None)
+    views = [VisitView(_view(compose(truth, t), _camera(x)), t) for t in (0, 1) for x in (-0.3, 0.0, 0.3)]
+    still = Rates(means=1e-12, means_final=1e-12, quats=0, log_scales=0, logit_opacities=0, sh_dc=0, sh_rest=0)
+    config = LongConfig(passes=40, background_rate=0.0, translation_rate=0.0, rotation_rate=0.0, rates=still)
+    fitted, losses = fit_chronology(unlit, views, key=jax.random.key(0), config=config)
+    item = truth.templates[0].splats
+    np.testing.assert_array_equal(fitted.shade[0], np.zeros((1, 4)))  # where it was first seen
+    wanted, found = (_lit(item, s) for s in (shade[1, 0], fitted.shade[1, 0]))
+    assert np.abs(found - wanted).mean() < 0.25 * np.abs(wanted).mean()
+    assert losses[-10:].mean() < 0.5 * losses[:10].mean()
+    without, _ = fit_chronology(
+        unlit, views, key=jax.random.key(0), config=dataclasses.replace(config, passes=2, shade_rate=0.0)
+    )
+    assert not np.asarray(without.shade).any()
 
 
 def test_windows_hold_every_pixel_of_a_region():

@@ -35,6 +35,7 @@ def make_chronology(*, templates: int = 2, dtype=jnp.float32) -> Chronology:
         visits=("a", "IMG_0001", "ü"),
         photographs=("a/000.png", "IMG_0001/x y.jpg"),
         since=jnp.asarray([0] * 8 + [1, 1, 2], jnp.int32) if templates else None,
+        shade=jnp.asarray(rng.normal(size=(t, templates, 4)), dtype) if templates > 1 else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -11,7 +12,15 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
 from ltgs_jax.render import RenderPlan, render
-from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats, pad_splats, transform_splats
+from ltgs_jax.scene import (
+    Chronology,
+    Splats,
+    compose,
+    concatenate_splats,
+    pad_splats,
+    shade_splats,
+    transform_splats,
+)
 
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
@@ -40,6 +49,9 @@ class LongConfig:
     """Step of a pose's rotation in radians."""
     anisotropy_penalty: float = 0.02
     """Weight that keeps template splats from becoming needles where few photographs see them."""
+    shade_rate: float = 5e-2
+    """Step of an object's shade at a pose, in log gain and that over the object's diameter; 0: it looks everywhere as
+    where it was first seen."""
     fit_poses: bool = True
     rates: Rates = field(default_factory=lambda: Rates(means=2e-4, means_final=2e-5, logit_opacities=2e-2))
 
@@ -92,33 +104,38 @@ def placements_of(chronology: Chronology) -> Placements:
 
 
 class _Variables(eqx.Module):
-    """What is optimised: splats, and a tangent per distinct pose."""
+    """What is optimised: splats, and a tangent and a shade per distinct pose."""
 
     splats: Splats
     tangents: Float[Array, "p 6"]
+    shades: Float[Array, "p 4"]
 
 
 class _Fixed(eqx.Module):
     """What stays: the ground's other splats; whose the variable ones are (0 the ground's, 1 + k template k's) and
-    whether they belong to a template or came after the first visit; poses, the diameter of each pose's object, and the
-    scene's extent."""
+    whether they belong to a template or came after the first visit; the middle and diameter, of the ground and every
+    template, that shades are measured by; poses, the diameter of each pose's object, and the scene's extent."""
 
     ground: Splats
     owner: Int[Array, " n"]
     came: Bool[Array, " n"]
+    frames: Float[Array, "k 4"]
     placements: Placements
     diameters: Float[Array, " p"]
     extent: Float[Array, ""]
 
 
-def _window_splats(splats: Splats, tangents, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
-    """What shows in a window: its variable splats, where they are at that visit, and those of the ground."""
-    poses = fixed.placements.poses @ SE3.exp(tangents)
-    here = poses[fixed.placements.index[visit]]
+def _window_splats(variables: _Variables, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
+    """What shows in a window: its variable splats, where and how lit they are at that visit, and the ground's."""
+    splats, index = variables.splats, fixed.placements.index[visit]
+    here = (fixed.placements.poses @ SE3.exp(variables.tangents))[index]
     still = SE3.identity((1,), splats.means.dtype)
     here = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), still, here)
     owner = fixed.owner.at[rows].get(mode="clip")
-    moved = transform_splats(here, _hide_padding(splats, rows, fixed.owner.shape[0]), owner)
+    shade = jnp.pad(variables.shades[index], ((1, 0), (0, 0)))[owner]
+    along = (splats.means - fixed.frames[owner, :3]) / fixed.frames[owner, 3:]
+    lit = shade_splats(splats, shade[:, 0] + jnp.sum(shade[:, 1:] * along, axis=-1))
+    moved = transform_splats(here, _hide_padding(lit, rows, fixed.owner.shape[0]), owner)
     around = jax.tree.map(lambda leaf: leaf.at[ground_rows].get(mode="clip"), fixed.ground)
     return concatenate_splats([moved, _hide_padding(around, ground_rows, fixed.ground.count)])
 
@@ -144,7 +161,7 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     owner, came = taken((fixed.owner, fixed.came))
 
     def objective(local: _Variables):
-        splats = _window_splats(local.splats, local.tangents, rows, ground_rows, window.visit, fixed)
+        splats = _window_splats(local, rows, ground_rows, window.visit, fixed)
         out = render(splats, window.camera, plan=plan)
         loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
         needle = jax.nn.relu(jnp.ptp(local.splats.log_scales, axis=-1) - jnp.log(8.0))
@@ -152,9 +169,10 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
         needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
         return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
 
-    local = _Variables(taken(variables.splats), variables.tangents)
+    local = eqx.tree_at(lambda v: v.splats, variables, taken(variables.splats))
     gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(local)
-    before = state._replace(mu=_with_rows(state.mu, taken), nu=_with_rows(state.nu, taken))
+    rows_of = partial(eqx.tree_at, lambda v: v.splats, replace_fn=taken)
+    before = state._replace(mu=rows_of(state.mu), nu=rows_of(state.nu))
     updates, after = adam().update(gradient, before)
     moves = scale_gradients(updates.splats, config.rates, fixed.extent, progress)
     colours = jnp.where(came, 1, config.background_rate)[:, None, None] * moves.sh
@@ -162,19 +180,18 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     moves = eqx.tree_at(lambda m: m.sh, moves, colours)
     # A pose of an object that this window does not show has no gradient, and Adam's momentum must not carry it on.
     seen = jnp.any(gradient.tangents != 0, axis=-1)
-    free = (seen & ~fixed.placements.fixed & config.fit_poses)[:, None]
+    free = (seen & ~fixed.placements.fixed)[:, None]
     pace = jnp.where(jnp.arange(6) < 3, config.translation_rate * fixed.diameters[:, None], config.rotation_rate)
-    tangents = variables.tangents - jnp.where(free, pace * 0.1**progress * updates.tangents, 0)
-    variables = _Variables(put(variables.splats, eqx.apply_updates(local.splats, moves)), tangents)
+    pace = 0.1**progress * pace * config.fit_poses
+    tangents = variables.tangents - jnp.where(free, pace * updates.tangents, 0)
+    shades = variables.shades - jnp.where(free, 0.1**progress * config.shade_rate * updates.shades, 0)
+    variables = _Variables(put(variables.splats, eqx.apply_updates(local.splats, moves)), tangents, shades)
 
     def merged(old: _Variables, new: _Variables) -> _Variables:
-        return _Variables(put(old.splats, new.splats), jnp.where(seen[:, None], new.tangents, old.tangents))
+        own = [jnp.where(seen[:, None], b, a) for a, b in ((old.tangents, new.tangents), (old.shades, new.shades))]
+        return _Variables(put(old.splats, new.splats), *own)
 
     return variables, after._replace(mu=merged(state.mu, after.mu), nu=merged(state.nu, after.nu)), loss, overflow
-
-
-def _with_rows(moments: _Variables, taken) -> _Variables:
-    return _Variables(taken(moments.splats), moments.tangents)
 
 
 def fit_chronology(
@@ -213,18 +230,22 @@ def fit_chronology(
     every = jax.tree.map(np.array, concatenate_splats([background, *(m.splats for m in templates)]))
     placements = placements_of(chronology)
     diameters = np.asarray([template_diameter(m.splats) for m in templates], np.float32)
-    near = came | _close_to_objects(every, templates, placements, diameters)
+    middles = [np.median(m.splats.means, axis=0) for m in templates]
+    frames = np.concatenate([[[0, 0, 0, 1]], np.c_[np.reshape(middles, (-1, 3)), diameters]])
+    near = came | _close_to_objects(every, frames[1:], placements)
     may_change = (owner > 0) | (near & within_change(votes))
     free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
     fixed = _Fixed(
         jax.device_put(pad_splats(every[held], 1)),
         jnp.asarray(owner[free]),
         jnp.asarray(came[free]),
+        jnp.asarray(frames, jnp.float32),
         placements,
         jnp.asarray(diameters[np.asarray(placements.template)]),
         jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32),
     )
-    start = _Variables(jax.device_put(every[free]), jnp.zeros((len(placements.template), 6), jnp.float32))
+    still = [jnp.zeros((len(placements.template), freedoms), jnp.float32) for freedoms in (6, 4)]
+    start = _Variables(jax.device_put(every[free]), *still)
     rows = [(_rows_among(w.rows, free), _rows_among(w.rows, held)) for w in windows]
     fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, config=config, progress=progress)
     for leaf, new in zip(jax.tree.leaves(every), jax.tree.leaves(fitted.splats), strict=True):
@@ -232,22 +253,28 @@ def fit_chronology(
     ends = np.cumsum([background.count, *(m.splats.count for m in templates)])
     parts = [every[slice(a, b)] for a, b in zip([0, *ends[:-1]], ends, strict=True)]
     poses = (placements.poses @ SE3.exp(fitted.tangents))[placements.index]
+    slopes = fitted.shades[:, 1:] / fixed.diameters[:, None]
+    constants = fitted.shades[:, 0] - jnp.sum(slopes * fixed.frames[1 + placements.template, :3], axis=-1)
+    shade = jnp.concatenate([constants[:, None], slopes], axis=-1)[placements.index]
     fitted = eqx.tree_at(
-        lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template), chronology, (*parts, poses)
+        lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template, c.shade),
+        chronology,
+        (*parts, poses, shade),
+        is_leaf=lambda leaf: leaf is None,
     )
     return jax.tree.map(jnp.asarray, fitted), losses
 
 
 def _close_to_objects(
-    splats: Splats, templates: Sequence[Template], placements: Placements, diameters: Float[np.ndarray, " k"]
+    splats: Splats, frames: Float[np.ndarray, "k 4"], placements: Placements
 ) -> Bool[np.ndarray, " n"]:
     """Splats that lie whole within a sphere of twice an object's size around a place where it stood: what floats
     before the cameras would take on what a window shows, and veil other views with it."""
     close = np.zeros(splats.count, bool)
     reach = 2 * np.exp(splats.log_scales.max(axis=-1))
     for k, pose in zip(np.asarray(placements.template), placements.poses.as_matrix(), strict=True):
-        middle = np.asarray(pose)[:3] @ np.append(np.median(templates[k].splats.means, axis=0), 1)
-        close |= np.linalg.norm(splats.means - middle, axis=-1) + reach < diameters[k]
+        middle = np.asarray(pose)[:3] @ np.append(frames[k, :3], 1)
+        close |= np.linalg.norm(splats.means - middle, axis=-1) + reach < frames[k, 3]
     return close
 
 
@@ -310,7 +337,7 @@ def _fit_windows(
 @eqx.filter_jit
 def _shown(variables: _Variables, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
     own = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), variables.splats)
-    return _window_splats(own, variables.tangents, rows, ground_rows, visit, fixed)
+    return _window_splats(eqx.tree_at(lambda v: v.splats, variables, own), rows, ground_rows, visit, fixed)
 
 
 def _most(rows) -> tuple[int, int]:

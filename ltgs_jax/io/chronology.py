@@ -33,6 +33,8 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
     }
     if chronology.since is not None:
         arrays["background.since"] = chronology.since
+    if chronology.shade is not None:
+        arrays["shade"] = chronology.shade
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
@@ -83,6 +85,7 @@ def load_chronology(folder: str | Path) -> Chronology:
         visits=visits,
         photographs=photographs,
         since=take("background.since", (n,), dtypes=("int32",)) if "background.since" in arrays else None,
+        shade=take("shade", (t, k, 4)) if "shade" in arrays else None,
     )
 
 

@@ -231,6 +231,8 @@ def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
         "xyz": np.asarray(chronology.world_from_template.xyz),
         "visible": np.asarray(chronology.visible),
     }
+    if chronology.shade is not None:
+        arrays["shade"] = np.asarray(chronology.shade)
     for k, template in enumerate(chronology.templates):
         arrays |= pack_splats(f"template{k}.", template.splats)
         arrays[f"template{k}.errors"] = state.template_errors[k]
@@ -251,6 +253,7 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
     start = State.of_initial(unpack_splats("background.", arrays), arrays["errors"], visits)
     start = eqx.tree_at(lambda s: (s.guessed, s.chronology.since), start, (arrays["guessed"], arrays["since"]))
     poses = SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"]))
-    return _with_templates(
+    state = _with_templates(
         start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)
     )
+    return eqx.tree_at(lambda s: s.chronology.shade, state, arrays.get("shade"), is_leaf=_is_none)

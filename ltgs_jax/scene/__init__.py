@@ -8,4 +8,5 @@ from .chronology import ground_layers as ground_layers
 from .splats import Splats as Splats
 from .splats import concatenate_splats as concatenate_splats
 from .splats import pad_splats as pad_splats
+from .splats import shade_splats as shade_splats
 from .splats import transform_splats as transform_splats

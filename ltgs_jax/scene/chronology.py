@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
 
-from .splats import Splats, concatenate_splats, transform_splats
+from .splats import Splats, concatenate_splats, shade_splats, transform_splats
 
 
 class Template(eqx.Module):
@@ -28,7 +28,9 @@ class Chronology(eqx.Module):
     `world_from_template[t, k]` is the paper's P₀→ₜ, `visible[t, k]` its temporal opacity filter M_{t,o}; `exposure`
     [p 3 2] is gain and offset per channel of each of the p photographs in `photographs` that has its own (none when
     the light did not change); `since` [n] the visit from which on each of the background's splats shows, ground that a
-    later visit brought to light (None: all from the first).
+    later visit brought to light (None: all from the first); `shade` [t k 4] how each template is lit where it stands,
+    beside where it was first seen: log of the gain on its colours, a constant and a slope per scene unit along the
+    axes of its frame (None: as it was first seen, everywhere).
     """
 
     background: Splats
@@ -39,6 +41,7 @@ class Chronology(eqx.Module):
     visits: tuple[str, ...] = eqx.field(static=True)
     photographs: tuple[str, ...] = eqx.field(static=True, default=())
     since: Int[Array, " n"] | None = None
+    shade: Float[Array, "t k 4"] | None = None
 
     @staticmethod
     def of_initial(background: Splats, visits: tuple[str, ...]) -> "Chronology":
@@ -65,8 +68,9 @@ def ground_layers(chronology: Chronology) -> dict[int, Splats]:
 def compose(chronology: Chronology, t: int | Int[Array, ""]) -> Splats:
     """The scene at visit `t`: background, then every template moved to its pose, hidden where it is not visible.
 
-    Equation 1 of the LTGS paper and its opacity filter. What is hidden keeps its place in the arrays with opacity 0, so
-    that the shapes do not depend on `t`, which may be traced; `drop_hidden` leaves it out.
+    Equation 1 of the LTGS paper and its opacity filter, and the shade of each object where it stands. What is hidden
+    keeps its place in the arrays with opacity 0, so that the shapes do not depend on `t`, which may be traced;
+    `drop_hidden` leaves it out.
 
     Raises ValueError when `t` is not a visit.
     """
@@ -82,6 +86,9 @@ def compose(chronology: Chronology, t: int | Int[Array, ""]) -> Splats:
     # All templates at once: what there is to compile does not grow with their number.
     splats = concatenate_splats([template.splats for template in chronology.templates])
     owner = np.repeat(np.arange(len(chronology.templates)), [m.splats.count for m in chronology.templates])
+    if chronology.shade is not None:
+        shade = chronology.shade[t][owner]
+        splats = shade_splats(splats, shade[:, 0] + jnp.sum(shade[:, 1:] * splats.means, axis=-1))
     moved = transform_splats(chronology.world_from_template[t], splats, owner)
     logits = jnp.where(chronology.visible[t][owner], moved.logit_opacities, -jnp.inf)
     return concatenate_splats([background, eqx.tree_at(lambda s: s.logit_opacities, moved, logits)])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ltgs_jax.geometry import SE3, multiply_quats, rotate_sh, sh_degree, sh_rotations
+from ltgs_jax.geometry import C0, SE3, multiply_quats, rotate_sh, sh_degree, sh_rotations
 
 
 class Splats(eqx.Module):
@@ -68,6 +68,13 @@ def pad_splats(splats: Splats, multiple: int) -> Splats:
     padded = jax.tree.map(lambda leaf: np.pad(np.asarray(leaf), ((0, missing),) + ((0, 0),) * (leaf.ndim - 1)), splats)
     padded.logit_opacities[splats.count :] = -np.inf
     return padded
+
+
+def shade_splats(splats: Splats, log_gain: Float[Array, " n"]) -> Splats:
+    """Splats with every colour times the exponential of its own gain."""
+    gain = jnp.exp(log_gain)[:, None, None]
+    # A colour is C0·sh_0 + 0.5 plus what depends on the direction.
+    return eqx.tree_at(lambda s: s.sh, splats, (gain * splats.sh).at[:, :1].add((gain - 1) * 0.5 / C0))
 
 
 def transform_splats(b_from_a: SE3, splats: Splats, owner: Int[Array, " n"] | None = None) -> Splats:
