@@ -157,7 +157,7 @@ ABLATION = {
     "full": (),
     "without known objects": (("template.tau_same", 2.0),),
     "without pose refinement": (("fit.long.fit_poses", False),),
-    "without shades": (("fit.long.shade_rate", 0.0),),
+    "without shades and shadows": (("fit.long.shade_rate", 0.0),),
     "without background refinement": (("fit.long.background_rate", 0.0),),
     "without photographs of the first visit": (("fit.long.replay", 0.0),),
     "without the long fit": (("fit.long.passes", 0),),

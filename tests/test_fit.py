@@ -26,7 +26,7 @@ from ltgs_jax.fit.optimizer import Rates
 from ltgs_jax.fit.windows import cover_region, crop_camera
 from ltgs_jax.geometry import C0, SE3, Camera, stack_cameras
 from ltgs_jax.render import render
-from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats
+from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, concatenate_splats, ground_gain
 
 _SIZE = 32
 
@@ -200,6 +200,41 @@ def test_long_fit_finds_how_an_object_is_lit_where_it_stands_now():
         unlit, views, key=jax.random.key(0), config=dataclasses.replace(config, passes=2, shade_rate=0.0)
     )
     assert not np.asarray(without.shade).any()
+
+
+def test_a_shadow_darkens_the_ground_where_and_while_it_is_cast():
+    cast = jnp.asarray([[False, True], [True, True], [True, False]])
+    shadows = Shadows(jnp.asarray([[0.0, 0, 0], [1, 0, 0]]), jnp.full(2, 0.1), jnp.asarray([-0.5, 0.2]), cast)
+    means = jnp.asarray([[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [5, 5, 5]])
+    since = jnp.zeros(4, jnp.int32)
+    half = np.exp(-0.5)
+    gains = [np.asarray(ground_gain(shadows, means, since, t)) for t in range(3)]
+    np.testing.assert_array_equal(gains[0], 0)
+    np.testing.assert_allclose(gains[1], [-0.5, -0.5 * half, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(gains[2], [-0.5, -0.5 * half, -0.2, 0], rtol=1e-6)
+    # Ground that came to light at visit 1 has that visit's shadows in its colours.
+    np.testing.assert_allclose(ground_gain(shadows, means, since + 1, 2), [0, 0, -0.2, 0], rtol=1e-6)
+    np.testing.assert_allclose(ground_gain(shadows, means, since + 1, 0), [0.5, 0.5 * half, 0, 0], rtol=1e-6)
+    slope = jax.grad(lambda g: ground_gain(eqx.tree_at(lambda s: s.log_gain, shadows, g), means, since, 1).sum())
+    np.testing.assert_allclose(slope(shadows.log_gain), [1 + half, 0], rtol=1e-6)
+
+
+def test_long_fit_finds_the_shadow_of_what_moved():
+    plain, _ = _moved_chronology(0.0)
+    middle = np.asarray(plain.world_from_template.xyz[1, 0])
+    blob = Shadows(jnp.asarray(middle)[None], jnp.full(1, 0.2), jnp.full(1, -0.8), jnp.asarray([[False], [True]]))
+    truth = eqx.tree_at(lambda c: c.shadows, plain, blob, is_leaf=lambda leaf: leaf is None)
+    views = [VisitView(_view(compose(truth, t), _camera(x)), t) for t in (0, 1) for x in (-0.3, 0.0, 0.3)]
+    still = Rates(means=1e-12, means_final=1e-12, quats=0, log_scales=0, logit_opacities=0, sh_dc=0, sh_rest=0)
+    config = LongConfig(passes=40, background_rate=0.0, translation_rate=0.0, rotation_rate=0.0, rates=still)
+    fitted, losses = fit_chronology(plain, views, key=jax.random.key(0), config=config)
+    assert losses[-10:].mean() < 0.7 * losses[:10].mean()
+    for a, b in zip(jax.tree.leaves(fitted.background), jax.tree.leaves(plain.background), strict=True):
+        np.testing.assert_array_equal(a, b)
+    count = plain.background.count
+    wanted, found, before = (np.asarray(compose(c, 1).sh[:count, 0]) for c in (truth, fitted, plain))
+    assert np.abs(found - wanted).sum() < 0.6 * np.abs(before - wanted).sum()
+    np.testing.assert_array_equal(compose(fitted, 0).sh[:count], compose(plain, 0).sh[:count])
 
 
 def test_windows_hold_every_pixel_of_a_region():

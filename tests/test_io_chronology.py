@@ -12,7 +12,7 @@ import pytest
 
 from ltgs_jax import io
 from ltgs_jax.geometry import SE3
-from ltgs_jax.scene import Chronology, Splats, Template, compose, ground_layers
+from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, ground_layers
 
 
 def make_splats(rng, n: int, k: int, dtype) -> Splats:
@@ -36,7 +36,13 @@ def make_chronology(*, templates: int = 2, dtype=jnp.float32) -> Chronology:
         photographs=("a/000.png", "IMG_0001/x y.jpg"),
         since=jnp.asarray([0] * 8 + [1, 1, 2], jnp.int32) if templates else None,
         shade=jnp.asarray(rng.normal(size=(t, templates, 4)), dtype) if templates > 1 else None,
+        shadows=_shadows(rng, t, dtype) if templates > 1 else None,
     )
+
+
+def _shadows(rng, t: int, dtype) -> Shadows:
+    blobs = (jnp.asarray(rng.normal(size=shape), dtype) for shape in ((5, 3), 5, 5))
+    return Shadows(*blobs, jnp.asarray(rng.random((t, 5)) < 0.5))
 
 
 def assert_same(a: Chronology, b: Chronology) -> None:

@@ -7,6 +7,7 @@ import sys
 import time
 import urllib.request
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from headless import open_browser
 from scipy.spatial.transform import Rotation
 
 from ltgs_jax.geometry import C0, SE3, Camera
-from ltgs_jax.io import InputError, save_chronology
+from ltgs_jax.io import InputError, load_chronology, save_chronology
 from ltgs_jax.report import up_direction
-from ltgs_jax.scene import Chronology, Splats, Template
+from ltgs_jax.scene import Chronology, Shadows, Splats, Template
 from ltgs_jax.view.layers import extent_of, layer_of, place_at, viewpoint_of
 
 viser = pytest.importorskip("viser", reason="the extra [view] is not installed")
@@ -178,6 +179,25 @@ def test_the_controls(viewer):
     viewer._show_frusta.value = True
     viewer._refresh()
     assert [viewer._frusta[f"{visit}/0.png"].visible for visit in VISITS] == [False, False, True]
+
+
+def test_colours_are_those_of_the_visit(folder):
+    chronology = load_chronology(folder)
+    shade = jnp.zeros((3, len(chronology.templates), 4)).at[1, 0, 0].set(-0.7)
+    middle = np.asarray(chronology.background.means)[0]
+    blob = Shadows(jnp.asarray(middle)[None], jnp.asarray([0.1]), jnp.asarray([-0.7]), jnp.asarray([[0], [1], [0]]) > 0)
+    lit = eqx.tree_at(lambda c: (c.shade, c.shadows), chronology, (shade, blob), is_leaf=lambda leaf: leaf is None)
+    save_chronology(folder, lit)
+    viewer = start(folder, port=18080)
+    try:
+        handles = viewer._objects[0], viewer._ground[0]
+        before = [np.asarray(handle.rgbs, float).sum() for handle in handles]
+        viewer.show_visit(1, animated=False)
+        assert all(np.asarray(h.rgbs, float).sum() < b for h, b in zip(handles, before, strict=True))
+        viewer.show_visit(0, animated=False)
+        assert [np.asarray(handle.rgbs, float).sum() for handle in handles] == before
+    finally:
+        viewer.server.stop()
 
 
 def test_a_folder_without_photographs_can_be_viewed(folder):

@@ -14,9 +14,11 @@ from ltgs_jax.geometry import SE3
 from ltgs_jax.render import RenderPlan, render
 from ltgs_jax.scene import (
     Chronology,
+    Shadows,
     Splats,
     compose,
     concatenate_splats,
+    ground_gain,
     pad_splats,
     shade_splats,
     transform_splats,
@@ -24,8 +26,11 @@ from ltgs_jax.scene import (
 
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
+from .shadows import lay_blobs
 from .views import StreamedView, View, plan_for, scene_extent, size_of
 from .windows import Shown, Window, window_side, windows_of, within_change
+
+_PRICE = 1e-3  # of a shadow's gain, as the slope of the loss
 
 
 @dataclass(frozen=True)
@@ -50,8 +55,8 @@ class LongConfig:
     anisotropy_penalty: float = 0.02
     """Weight that keeps template splats from becoming needles where few photographs see them."""
     shade_rate: float = 5e-2
-    """Step of an object's shade at a pose, in log gain and that over the object's diameter; 0: it looks everywhere as
-    where it was first seen."""
+    """Step of an object's shade at a pose, in log gain and that over the object's diameter, and of the shadow that it
+    casts there; 0: it looks everywhere as where it was first seen."""
     fit_poses: bool = True
     rates: Rates = field(default_factory=lambda: Rates(means=2e-4, means_final=2e-5, logit_opacities=2e-2))
 
@@ -104,21 +109,26 @@ def placements_of(chronology: Chronology) -> Placements:
 
 
 class _Variables(eqx.Module):
-    """What is optimised: splats, and a tangent and a shade per distinct pose."""
+    """What is optimised: splats, a tangent and a shade per distinct pose, and the gains of the shadows' blobs."""
 
     splats: Splats
     tangents: Float[Array, "p 6"]
     shades: Float[Array, "p 4"]
+    shadows: Float[Array, " m"]
 
 
 class _Fixed(eqx.Module):
-    """What stays: the ground's other splats; whose the variable ones are (0 the ground's, 1 + k template k's) and
-    whether they belong to a template or came after the first visit; the middle and diameter, of the ground and every
-    template, that shades are measured by; poses, the diameter of each pose's object, and the scene's extent."""
+    """What stays: the ground's other splats, and since when they show; whose the variable ones are (0 the ground's,
+    1 + k template k's), since when the ground's show, and whether they belong to a template or came after the first
+    visit; shadows without their gains; the middle and diameter, of the ground and every template, that shades are
+    measured by; poses, the diameter of each pose's object, and the scene's extent."""
 
     ground: Splats
+    ground_since: Int[Array, " m"]
     owner: Int[Array, " n"]
+    since: Int[Array, " n"]
     came: Bool[Array, " n"]
+    shadows: Shadows
     frames: Float[Array, "k 4"]
     placements: Placements
     diameters: Float[Array, " p"]
@@ -134,9 +144,14 @@ def _window_splats(variables: _Variables, rows, ground_rows, visit, fixed: _Fixe
     owner = fixed.owner.at[rows].get(mode="clip")
     shade = jnp.pad(variables.shades[index], ((1, 0), (0, 0)))[owner]
     along = (splats.means - fixed.frames[owner, :3]) / fixed.frames[owner, 3:]
-    lit = shade_splats(splats, shade[:, 0] + jnp.sum(shade[:, 1:] * along, axis=-1))
+    shadows = eqx.tree_at(lambda s: s.log_gain, fixed.shadows, variables.shadows)
+    since = fixed.since.at[rows].get(mode="clip")
+    gain = jnp.where(owner == 0, ground_gain(shadows, splats.means, since, visit), shade[:, 0])
+    lit = shade_splats(splats, gain + jnp.sum(shade[:, 1:] * along, axis=-1))
     moved = transform_splats(here, _hide_padding(lit, rows, fixed.owner.shape[0]), owner)
-    around = jax.tree.map(lambda leaf: leaf.at[ground_rows].get(mode="clip"), fixed.ground)
+    ground = (fixed.ground, fixed.ground_since)
+    around, since = jax.tree.map(lambda leaf: leaf.at[ground_rows].get(mode="clip"), ground)
+    around = shade_splats(around, ground_gain(shadows, around.means, since, visit))
     return concatenate_splats([moved, _hide_padding(around, ground_rows, fixed.ground.count)])
 
 
@@ -171,6 +186,9 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
 
     local = eqx.tree_at(lambda v: v.splats, variables, taken(variables.splats))
     gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(local)
+    # What a window hardly shows of a shadow is held to nothing.
+    leaning = jnp.where(gradient.shadows != 0, gradient.shadows + _PRICE * variables.shadows, 0)
+    gradient = eqx.tree_at(lambda g: g.shadows, gradient, leaning)
     rows_of = partial(eqx.tree_at, lambda v: v.splats, replace_fn=taken)
     before = state._replace(mu=rows_of(state.mu), nu=rows_of(state.nu))
     updates, after = adam().update(gradient, before)
@@ -184,12 +202,19 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     pace = jnp.where(jnp.arange(6) < 3, config.translation_rate * fixed.diameters[:, None], config.rotation_rate)
     pace = 0.1**progress * pace * config.fit_poses
     tangents = variables.tangents - jnp.where(free, pace * updates.tangents, 0)
-    shades = variables.shades - jnp.where(free, 0.1**progress * config.shade_rate * updates.shades, 0)
-    variables = _Variables(put(variables.splats, eqx.apply_updates(local.splats, moves)), tangents, shades)
+    pace = 0.1**progress * config.shade_rate
+    shades = variables.shades - jnp.where(free, pace * updates.shades, 0)
+    cast = gradient.shadows != 0
+    shadows = variables.shadows - jnp.where(cast, pace * updates.shadows, 0)
+    variables = _Variables(put(variables.splats, eqx.apply_updates(local.splats, moves)), tangents, shades, shadows)
 
     def merged(old: _Variables, new: _Variables) -> _Variables:
-        own = [jnp.where(seen[:, None], b, a) for a, b in ((old.tangents, new.tangents), (old.shades, new.shades))]
-        return _Variables(put(old.splats, new.splats), *own)
+        return _Variables(
+            put(old.splats, new.splats),
+            jnp.where(seen[:, None], new.tangents, old.tangents),
+            jnp.where(seen[:, None], new.shades, old.shades),
+            jnp.where(cast, new.shadows, old.shadows),
+        )
 
     return variables, after._replace(mu=merged(state.mu, after.mu), nu=merged(state.nu, after.nu)), loss, overflow
 
@@ -217,10 +242,12 @@ def fit_chronology(
     if config.passes == 0:
         return chronology, np.zeros(0, np.float32)
     side = window_side([size_of(v.view) for v in views], config.window)
-    background, since, templates = chronology.background, chronology.since, chronology.templates
-    late = np.zeros(background.count, bool) if since is None else np.asarray(since) > 0
+    background, templates = chronology.background, chronology.templates
     owner = np.repeat(np.arange(1 + len(templates)), [background.count, *(m.splats.count for m in templates)])
-    came = np.where(owner == 0, np.pad(late, (0, len(owner) - len(late))), True)
+    since = np.zeros(len(owner), np.int32)
+    if chronology.since is not None:
+        since[: background.count] = chronology.since
+    came = (owner > 0) | (since > 0)
     visits = {}
     for t in sorted({v.visit for v in views}):
         splats = jax.tree.map(np.asarray, _composed(chronology, jnp.asarray(t)))
@@ -233,19 +260,23 @@ def fit_chronology(
     middles = [np.median(m.splats.means, axis=0) for m in templates]
     frames = np.concatenate([[[0, 0, 0, 1]], np.c_[np.reshape(middles, (-1, 3)), diameters]])
     near = came | _close_to_objects(every, frames[1:], placements)
+    shadows = _shadows_of(chronology, placements, frames[1:])
     may_change = (owner > 0) | (near & within_change(votes))
     free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
     fixed = _Fixed(
         jax.device_put(pad_splats(every[held], 1)),
+        jnp.asarray(since[held]),
         jnp.asarray(owner[free]),
+        jnp.asarray(since[free]),
         jnp.asarray(came[free]),
+        shadows,
         jnp.asarray(frames, jnp.float32),
         placements,
         jnp.asarray(diameters[np.asarray(placements.template)]),
         jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32),
     )
     still = [jnp.zeros((len(placements.template), freedoms), jnp.float32) for freedoms in (6, 4)]
-    start = _Variables(jax.device_put(every[free]), *still)
+    start = _Variables(jax.device_put(every[free]), *still, shadows.log_gain)
     rows = [(_rows_among(w.rows, free), _rows_among(w.rows, held)) for w in windows]
     fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, config=config, progress=progress)
     for leaf, new in zip(jax.tree.leaves(every), jax.tree.leaves(fitted.splats), strict=True):
@@ -257,12 +288,21 @@ def fit_chronology(
     constants = fitted.shades[:, 0] - jnp.sum(slopes * fixed.frames[1 + placements.template, :3], axis=-1)
     shade = jnp.concatenate([constants[:, None], slopes], axis=-1)[placements.index]
     fitted = eqx.tree_at(
-        lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template, c.shade),
+        lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template, c.shade, c.shadows),
         chronology,
-        (*parts, poses, shade),
+        (*parts, poses, shade, eqx.tree_at(lambda s: s.log_gain, shadows, fitted.shadows)),
         is_leaf=lambda leaf: leaf is None,
     )
     return jax.tree.map(jnp.asarray, fitted), losses
+
+
+def _shadows_of(chronology: Chronology, placements: Placements, frames: Float[np.ndarray, "k 4"]) -> Shadows:
+    """Shadows without effect of every place at which an object stands at some visits and not at others."""
+    template, index = np.asarray(placements.template), np.asarray(placements.index)
+    middles = placements.poses.apply(jnp.asarray(frames[template, None, :3], jnp.float32))[:, 0]
+    here = index[:, template] == np.arange(len(template))
+    occupied = here & np.asarray(chronology.visible)[:, template]
+    return lay_blobs(chronology.background, np.asarray(middles), frames[template, 3], occupied)
 
 
 def _close_to_objects(

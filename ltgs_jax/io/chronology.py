@@ -9,12 +9,13 @@ import numpy as np
 import safetensors.numpy
 
 from ltgs_jax.geometry import SE3
-from ltgs_jax.scene import Chronology, Splats, Template
+from ltgs_jax.scene import Chronology, Shadows, Splats, Template
 
 from .files import InputError, read_bytes, safe_name, write_bytes, write_json
 
 _VERSION = 1
 _SPLAT_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
+_SHADOW_FIELDS = ("centers", "radii", "log_gain", "cast")
 _DTYPES = ("float32", "float64")
 
 
@@ -35,6 +36,8 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
         arrays["background.since"] = chronology.since
     if chronology.shade is not None:
         arrays["shade"] = chronology.shade
+    if chronology.shadows is not None:
+        arrays |= {f"shadows.{field}": getattr(chronology.shadows, field) for field in _SHADOW_FIELDS}
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
@@ -86,6 +89,7 @@ def load_chronology(folder: str | Path) -> Chronology:
         photographs=photographs,
         since=take("background.since", (n,), dtypes=("int32",)) if "background.since" in arrays else None,
         shade=take("shade", (t, k, 4)) if "shade" in arrays else None,
+        shadows=take.shadows(t) if "shadows.cast" in arrays else None,
     )
 
 
@@ -156,3 +160,10 @@ class _Taker:
             raise InputError(f"{self._path}: {name}.sh has {k[0]} coefficients")
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *k, 3))
         return Splats(*(self(f"{name}.{field}", shape) for field, shape in zip(_SPLAT_FIELDS, shapes, strict=True)))
+
+    def shadows(self, t: int) -> Shadows:
+        """The shadows of t visits."""
+        m = self._arrays["shadows.cast"].shape[-1:] or (0,)
+        shapes = ((*m, 3), m, m)
+        arrays = [self(f"shadows.{field}", shape) for field, shape in zip(_SHADOW_FIELDS, shapes, strict=False)]
+        return Shadows(*arrays, self("shadows.cast", (t, *m), dtypes=("bool",)))

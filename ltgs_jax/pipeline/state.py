@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
-from ltgs_jax.scene import Chronology, Splats, Template, compose, concatenate_splats
+from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, concatenate_splats
 from ltgs_jax.template import Support
 
 from .looks import on_host
@@ -206,6 +206,7 @@ def _is_none(leaf) -> bool:
     return leaf is None
 
 
+_SHADOW_FIELDS = ("centers", "radii", "log_gain", "cast")
 _FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
@@ -233,6 +234,8 @@ def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
     }
     if chronology.shade is not None:
         arrays["shade"] = np.asarray(chronology.shade)
+    if chronology.shadows is not None:
+        arrays |= {f"shadows.{field}": np.asarray(getattr(chronology.shadows, field)) for field in _SHADOW_FIELDS}
     for k, template in enumerate(chronology.templates):
         arrays |= pack_splats(f"template{k}.", template.splats)
         arrays[f"template{k}.errors"] = state.template_errors[k]
@@ -256,4 +259,6 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
     state = _with_templates(
         start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)
     )
-    return eqx.tree_at(lambda s: s.chronology.shade, state, arrays.get("shade"), is_leaf=_is_none)
+    shadows = [arrays[f"shadows.{field}"] for field in _SHADOW_FIELDS] if "shadows.cast" in arrays else None
+    lit = (arrays.get("shade"), None if shadows is None else Shadows(*shadows))
+    return eqx.tree_at(lambda s: (s.chronology.shade, s.chronology.shadows), state, lit, is_leaf=_is_none)

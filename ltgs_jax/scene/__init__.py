@@ -5,6 +5,10 @@ from .chronology import Template as Template
 from .chronology import compose as compose
 from .chronology import drop_hidden as drop_hidden
 from .chronology import ground_layers as ground_layers
+from .chronology import light as light
+from .chronology import owner_of as owner_of
+from .shadows import Shadows as Shadows
+from .shadows import ground_gain as ground_gain
 from .splats import Splats as Splats
 from .splats import concatenate_splats as concatenate_splats
 from .splats import pad_splats as pad_splats

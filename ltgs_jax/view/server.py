@@ -9,7 +9,7 @@ import numpy as np
 
 from ltgs_jax.io import load_chronology
 from ltgs_jax.report import Run, Shot, color_of, difference, fitted, happenings, read_run, read_shown, up_direction
-from ltgs_jax.scene import Chronology, ground_layers
+from ltgs_jax.scene import Chronology, ground_layers, light, owner_of
 
 from .layers import Layer, Viewpoint, extent_of, layer_of, place_at, viewpoint_of
 
@@ -84,9 +84,7 @@ class Viewer:
             return
         self._highlighted = identity
         self._chosen.value = _name_of(identity)
-        for template, layer, handle in zip(self._chronology.templates, self._layers, self._objects, strict=True):
-            chosen = template.identity == identity
-            handle.rgbs = layer.tinted(color_of(template.identity)) if chosen else layer.rgbs
+        self._tint_objects()
         self._label_highlighted()
 
     def hide(self, identity: int, hidden: bool = True) -> None:
@@ -191,9 +189,28 @@ class Viewer:
                 handle.wxyz, handle.position = place.wxyz, place.xyz
                 handle.visible = place.visible and template.identity not in self._hidden
 
+    def _tint_objects(self) -> None:
+        for template, layer, handle in zip(self._chronology.templates, self._layers, self._objects, strict=True):
+            chosen = template.identity == self._highlighted
+            handle.rgbs = layer.tinted(color_of(template.identity)) if chosen else layer.rgbs
+
+    def _light(self) -> None:
+        """Colours as they are lit at the visit."""
+        chronology = self._chronology
+        if chronology.shade is None and chronology.shadows is None:
+            return
+        ground, objects = light(chronology, self.visit)
+        since = np.zeros(ground.count) if chronology.since is None else np.asarray(chronology.since)
+        for t, handle in self._ground.items():
+            handle.rgbs = layer_of(ground[since == t]).rgbs
+        owner = owner_of(chronology)
+        self._layers = [layer_of(objects[owner == k]) for k in range(len(self._objects)) if objects is not None]
+        self._tint_objects()
+
     def _refresh(self) -> None:
         """Bring everything that depends on the visit and on what is hidden up to date."""
         self._place_objects(self.visit)
+        self._light()
         self._happened.content = self._events()
         if not self._shots:
             return
