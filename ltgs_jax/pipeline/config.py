@@ -76,7 +76,13 @@ def for_small_photographs(config: Config) -> Config:
     return replace(config, fit=replace(config.fit, initial=initial))
 
 
-_LEAST = {"io.max_side": 16, "fit.initial.max_splats": 4, "fit.initial.steps": 1, "fit.initial.grow_every": 1}
+_LEAST = {
+    "template.tau_gain": -math.inf,
+    "io.max_side": 16,
+    "fit.initial.max_splats": 4,
+    "fit.initial.steps": 1,
+    "fit.initial.grow_every": 1,
+}
 _MOST = {"fit.initial.sh_degree": 3}
 
 

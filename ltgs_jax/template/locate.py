@@ -297,13 +297,14 @@ class Refiner:
     def score(
         self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`, and the pixels it covers there."""
+        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`, and how many of the pixels that changed
+        it covers there."""
         m = poses.xyz.shape[0]
         errors, covered = [], []
         for start in range(0, m, _BATCH):
             images, cover = self.images(template, poses[start : start + _BATCH], crop, tolerance)
             errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
-            covered.append(np.sum(cover * np.asarray(crop.valid), axis=(1, 2, 3)))
+            covered.append(np.sum(cover * np.asarray(crop.valid & crop.region), axis=(1, 2, 3)))
         return np.concatenate(errors), np.concatenate(covered)
 
     def slide(
