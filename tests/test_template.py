@@ -24,7 +24,7 @@ from ltgs_jax.template import (
 from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
-from ltgs_jax.template.locate import freedoms_of
+from ltgs_jax.template.locate import freedoms_of, relit
 from ltgs_jax.template.removal import gone_evidence, taken_down
 
 
@@ -301,6 +301,20 @@ def test_polish_ends_where_the_unlikeness_is_least():
     kept = refiner.polish(splats, begin[None], crop, along, tolerance=0.04, rounds=3)
     np.testing.assert_allclose(kept.poses.quat[0], begin.quat, atol=1e-5)
     assert found.errors[0] <= kept.errors[0] <= before[0]
+
+
+def test_relit_takes_out_shade_and_not_print():
+    points, colors = _box(np.random.default_rng(5))
+    crop = _crop(_splats(points, colors, 0.015), 40)
+    target, cover = np.asarray(crop.target), np.asarray(crop.region, float)
+    ramp = np.exp(np.linspace(-0.4, 0.3, 40))[None, None, :, None]
+    shaded = np.where(cover[..., None] > 0, np.clip(target / ramp, 0, 1), target)
+    lit = relit(shaded, cover, crop)
+    inside = cover > 0
+    assert np.abs(lit - target)[inside].mean() < 0.5 * np.abs(shaded - target)[inside].mean()
+    np.testing.assert_array_equal(lit[~inside], shaded[~inside])
+    wrong = np.where(inside[..., None], target[:, :, ::-1], target)
+    assert np.abs(relit(wrong, cover, crop) - target)[inside].mean() > 0.8 * np.abs(wrong - target)[inside].mean()
 
 
 def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():

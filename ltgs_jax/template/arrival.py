@@ -25,6 +25,7 @@ from .locate import (
     likeness,
     overlap_of,
     recall_of,
+    relit,
     turned_round,
 )
 from .support import Support, Vantage, fit_support, rotation_about
@@ -213,18 +214,17 @@ def search_template(
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
     """Refine the poses of a search on the pixels, in all six freedoms, and the two best turns in place of what comes of
-    it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. Of the four the one
-    with the most evidence, not the least error: shade weighs as much as detail in the error, and it stays where it is
-    when an object turns. It stands upright, as it stood, unless the pixels clearly say that it leans.
+    it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. Of the three the one
+    with the most evidence when lit as the photographs show it: shade weighs as much as detail in the error, and it
+    stays where it is when an object turns. It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
     found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=0.1 * size, steps=12, blurred=3)
     first = found.poses[int(np.argmin(found.errors))]
     turned = _other_turns(search, first, crop, size=size, refiner=refiner)
-    placed = [
-        place_template(search, _polished(search, pose, None, crop, size, refiner)[0], crop, size=size, refiner=refiner)
-        for pose in (first, turned[0], turned[1])
-    ]
-    best = max(placed, key=lambda p: (p.worth, -p.error))
+    poses = [_polished(search, pose, None, crop, size, refiner)[0] for pose in (first, turned[0], turned[1])]
+    lit = [place_template(search, pose, crop, size=size, refiner=refiner, lit=True) for pose in poses]
+    chosen = max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))
+    best = place_template(search, poses[chosen], crop, size=size, refiner=refiner)
     upright = levelled(best.world_from_template, search)
     if upright is None:
         return best
@@ -290,12 +290,15 @@ def levelled(pose: SE3, search: Search) -> SE3 | None:
     return SE3.from_matrix(jnp.asarray(matrix, jnp.float32))
 
 
-def place_template(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """A search's template at this very pose, and how well it explains the windows there."""
+def place_template(
+    search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner, lit: bool = False
+) -> Placement:
+    """A search's template at this very pose, and how well it explains the windows there; `lit` as they show it."""
     images, cover = refiner.images(search.template, pose[None], crop, 0.1 * size)
-    error, gain = explained(images[0], crop)
+    shown = relit(images[0], cover[0], crop) if lit else images[0]
+    error, gain = explained(shown, crop)
     covered = cover[0] > 0.5
-    overlap, alike = overlap_of(images[0], covered, crop), likeness(images[0], cover[0], crop)
+    overlap, alike = overlap_of(shown, covered, crop), likeness(shown, cover[0], crop)
     return Placement(pose, error, gain, overlap, alike, recall_of(covered, crop), covered)
 
 

@@ -42,8 +42,8 @@ class TemplateConfig:
     tau_search: float = 0.25
     """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
     tau_gain: float = -0.25
-    """Share of the change that a known template must explain in the search, to be looked at closely: below 0 it looks worse
-    than nothing, as at a wrong turn."""
+    """Share of the change that a known template must explain in the search, to be looked at closely; below 0 it looks
+    worse than nothing, as at a wrong turn."""
     tau_remains: float = 0.35
     """Share of the change that may still be seen where a known template is put, for it to be what came."""
     tau_same: float = 0.04

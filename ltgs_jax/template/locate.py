@@ -127,6 +127,7 @@ _BEAM = ((32, 4), (16, 8), (8, 8), (6, 10), (6, 10), (6, 10))  # poses that a se
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
+_DARK, _TIMID, _GAIN = 0.05, 0.05, 0.7  # floor of ratios of colours; prior of a gain on nothing, and its most, in log
 _NARROWER = 0.7  # what is left of the width of parabolas from round to round
 
 
@@ -171,6 +172,26 @@ def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s
         return -1.0
     means = np.sum(agreement * shown, axis=(1, 2))[enough] / pixels[enough]
     return float(np.median(means))
+
+
+def relit(
+    images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop
+) -> Float[np.ndarray, "v s s 3"]:
+    """Composites with the template lit as the photographs show it: in each view a gain on what it covers, log-linear
+    over the window, fitted to the photograph. A print that is wrong stays wrong; a shade that turned with the object
+    does not."""
+    target, grey = np.asarray(crop.target).mean(axis=-1), images.mean(axis=-1)
+    rows, columns = np.mgrid[-1 : 1 : 1j * grey.shape[1], -1 : 1 : 1j * grey.shape[2]]
+    basis = np.stack([np.ones_like(rows), columns, rows], axis=-1)
+    shown = (cover > 0.5) & np.asarray(crop.valid)
+    lit = []
+    for image, g, t, c, mask in zip(images, grey, target, cover, shown, strict=True):
+        wanted = np.clip(np.log((t[mask] + _DARK) / (g[mask] + _DARK)), -1, 1)
+        near = basis[mask]
+        system = near.T @ near + _TIMID * max(len(near), 1) * np.eye(3)
+        gain = np.exp(np.clip(basis @ np.linalg.solve(system, near.T @ wanted), -_GAIN, _GAIN))
+        lit.append(image * (1 + c * (gain - 1))[..., None])
+    return np.stack(lit)
 
 
 def backdrop_error(crop: Crop) -> tuple[float, float]:
