@@ -24,6 +24,7 @@ from ltgs_jax.template import (
     explained,
     firm_part,
     make_crop,
+    place_template,
     search_template,
     settle_template,
     support_below,
@@ -38,6 +39,7 @@ _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pi
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
+_COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
@@ -259,7 +261,10 @@ def _placements(
             )
         ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
         for k in [k for k in ranked if searches[k].best_gain > config.template.tau_gain]:
-            found = settle_template(searches[k], arrival.crop, size=sizes[k], refiner=eye.refiner)
+            looks = {"size": sizes[k], "refiner": eye.refiner}
+            if place_template(searches[k], searches[k].poses[0], arrival.crop, **looks).recall < _COVERED:
+                continue
+            found = settle_template(searches[k], arrival.crop, **looks)
             placements[i, k] = found
             identity = state.chronology.templates[k].identity
             progress.note(
