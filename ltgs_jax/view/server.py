@@ -75,6 +75,7 @@ class Viewer:
                 if animated:
                     time.sleep(_SECONDS_OF_MOVING / steps)
             self.visit = visit
+            self._light()
             self._refresh()
         self._slider.value = visit
 
@@ -210,7 +211,6 @@ class Viewer:
     def _refresh(self) -> None:
         """Bring everything that depends on the visit and on what is hidden up to date."""
         self._place_objects(self.visit)
-        self._light()
         self._happened.content = self._events()
         if not self._shots:
             return
