@@ -28,6 +28,7 @@ from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import read_capture
 from ltgs_jax.localize import LocalizeConfig, localize
 from ltgs_jax.metrics import mask_f1, psnr
+from ltgs_jax.pipeline import PRESETS, for_small_photographs
 from ltgs_jax.pipeline.looks import Eye
 from ltgs_jax.register import RegisterConfig, register
 from ltgs_jax.render import RenderConfig, plan_render, render, render_reference
@@ -296,4 +297,19 @@ def curve_runs(effort: int) -> dict[str, list[Run]]:
         **{f"fit: {name}": [Run(f"{here}:run_fit", point)] for name, point in fits.items()},
         **{f"localisation: {name}": [Run(f"{here}:run_place", point)] for name, point in places.items()},
         **{f"detection: {n} px": [Run(f"{here}:run_detect", DetectPoint(n))] for n in (60, 80, 120, 160)},
+    }
+
+
+def chosen_points() -> dict[str, str]:
+    """Which points of the curves the presets chose, and which presets those are."""
+    tiny = PRESETS["tiny"].fit.initial
+    fast = for_small_photographs(PRESETS["fast"]).fit.initial
+    place, detect = PlacePoint(), DetectPoint()
+    return {
+        f"renderer: tile {RenderConfig().tile_size} px": "all",
+        f"registration: {RegisterConfig().quick.points} starts": "all",
+        f"localisation: {place.capture.width} px": "all: the photographs' own size",
+        f"detection: {detect.capture.width} px": "all: the photographs' own size",
+        f"fit: {tiny.steps} steps": "tiny",
+        f"fit: {fast.steps} steps": "fast",
     }

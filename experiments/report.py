@@ -7,7 +7,7 @@ bold, whosever it is.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +20,13 @@ _BOUNDS = ("3dgs-dense",)
 
 @dataclass(frozen=True)
 class Sheet:
-    """One section: its name, how it is drawn (comparison, variants, curves, stability), and its runs by row."""
+    """One section: its name, how it is drawn (comparison, variants, curves, stability), its runs by row, and the rows
+    that are a preset's choice, with the presets' names."""
 
     name: str
     kind: str
     runs: dict[str, list[Run]]
+    chosen: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,15 @@ def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
     named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
     named = {name: found for name, found in named.items() if found}
     labels = {run.options.scene.capture.scene for runs in sheet.runs.values() for run in runs}
-    return f"Capture: {', '.join(sorted(labels))}.\n\n" + table(
+    text = f"Capture: {', '.join(sorted(labels))}.\n\n" + table(
         ["variant", *(c.title for c in COLUMNS)], _cells(named, COLUMNS, named)
     )
+    points = [
+        (name, sum(mean_of(found, key) for key in ("seconds_initial", "seconds_cpu")), mean_of(found, "psnr_changed"))
+        for name, found in named.items()
+    ]
+    path = images / f"results_{sheet.name}.png"
+    return text + scatter(points, path, "CPU seconds, the first visit's among them", "PSNR changed, dB", sheet.chosen)
 
 
 def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
@@ -142,7 +150,9 @@ def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
             [[point, f"{row['seconds_ratio']:.3g}", f"{row['error']:.3g}"] for point, row in points],
         )
         triples = [(point, row["seconds_ratio"], row["error"]) for point, row in points]
-        text += scatter(triples, images / f"results_curve_{curve.replace(' ', '_')}.png", "CPU time / control", what)
+        chosen = {point: sheet.chosen.get(f"{curve}: {point}", "") for point, _ in points}
+        path = images / f"results_curve_{curve.replace(' ', '_')}.png"
+        text += scatter(triples, path, "CPU time / control", what, {k: v for k, v in chosen.items() if v})
     return text
 
 
@@ -182,9 +192,12 @@ def _axes(path: Path, rows: int = 1, columns: int = 1, size: tuple[float, float]
 _LABEL = 0.045  # height of a name on a plot, in heights of the plot
 
 
-def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) -> str:
-    """A labelled scatter plot against time, at least a hundredth of the longest; the Markdown that shows it, or nothing
-    without a point."""
+def scatter(
+    points: list[tuple[str, float, float]], path: Path, x: str, y: str, chosen: dict[str, str] | None = None
+) -> str:
+    """A labelled scatter plot against time, at least a hundredth of the longest, with a ring around what presets
+    chose; the Markdown that shows it, or nothing without a point."""
+    chosen = chosen or {}
     points = [p for p in points if math.isfinite(p[1]) and math.isfinite(p[2]) and p[1] > 0]
     if not points:
         return ""
@@ -192,6 +205,8 @@ def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) 
     points = [(name, max(a, least), b) for name, a, b in points]
     figure, axes = _axes(path)
     axes.plot([p[1] for p in points], [p[2] for p in points], "o", color="tab:brown")
+    rings = [p[1:] for p in points if p[0] in chosen]
+    axes.plot([a for a, _ in rings], [b for _, b in rings], "o", ms=13, mfc="none", mec="tab:brown")
     axes.set(xlabel=x, ylabel=y)
     times = [p[1] for p in points]
     if max(times) / min(times) > 5:
@@ -208,8 +223,10 @@ def scatter(points: list[tuple[str, float, float]], path: Path, x: str, y: str) 
     above = 1.0 + _LABEL
     for i in sorted(range(len(points)), key=lambda i: (-places[i][1].round(2), places[i][0])):
         above = level = min(places[i][1], above - _LABEL)
+        name, *place = points[i]
+        label = f"{name}, chosen ({chosen[name]})" if name in chosen else name
         axes.annotate(
-            points[i][0], points[i][1:], (1.02, level), textcoords="axes fraction", fontsize=7, va="center",
+            label, place, (1.02, level), textcoords="axes fraction", fontsize=7, va="center",
             arrowprops={"arrowstyle": "-", "color": "0.7", "linewidth": 0.5, "shrinkB": 3},
         )  # fmt: skip
     figure.savefig(path, dpi=80, bbox_inches="tight")

@@ -18,12 +18,14 @@ import tyro
 from experiments.baselines.method import MethodConfig
 from experiments.baselines.system import RIGID, SystemConfig
 from experiments.captures import CaptureConfig
-from experiments.curves import curve_runs
+from experiments.curves import chosen_points, curve_runs
 from experiments.engine import Run, grid, read_table, rebuild_table, run_all, vary
 from experiments.report import Sheet, write_results
 from experiments.scenes import SceneConfig
 from experiments.stability import stability_runs
 from ltgs_jax.fit import InitialConfig
+from ltgs_jax.pipeline import PRESETS as SYSTEM_PRESETS
+from ltgs_jax.pipeline import for_small_photographs
 
 _BASELINES = "experiments.baselines"
 _SYSTEM = f"{_BASELINES}.system:run"
@@ -153,6 +155,18 @@ def _variants(preset: Preset, scene: str, changes: dict[str, tuple[tuple[str, fl
     return {name: [Run(_SYSTEM, dataclasses.replace(base, overrides=over))] for name, over in changes.items()}
 
 
+def _whole(preset: Preset, scene: str) -> dict[str, list[Run]]:
+    """The whole system from the first visit on at each preset that is no dearer than this page's, the photographs at
+    this page's size."""
+    runs = {}
+    for name in ("tiny", "fast", "paper")[: ("tiny", "fast", "paper").index(preset.system) + 1]:
+        base = vary(preset.scene, "capture.scene", scene)
+        if name != preset.system:
+            base = dataclasses.replace(base, initial=for_small_photographs(SYSTEM_PRESETS[name]).fit.initial)
+        runs[name] = [Run(_SYSTEM, SystemConfig(base, name))]
+    return runs
+
+
 ABLATION = {
     "full": (),
     "without known objects": (("template.tau_same", 2.0),),
@@ -178,18 +192,20 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 6))
     poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
     features = grid(_SYSTEM, base, feature_noise=(0.0, 0.3, 1.0))
+    own = {"as it is": preset.system, "full": preset.system}
     hyper = _variants(preset, scene, {"as it is": ()})
     for name, values in HYPERPARAMETERS.items():
         hyper |= _variants(preset, scene, {f"{name} {value}": ((name, value),) for value in values})
     return [
         Sheet("comparison", "comparison", comparison_runs(preset, options.captures, options.max_side)),
-        Sheet("ablation", "variants", _variants(preset, scene, ABLATION)),
-        Sheet("curves", "curves", curve_runs(preset.effort)),
+        Sheet("ablation", "variants", _variants(preset, scene, ABLATION), own),
+        Sheet("curves", "curves", curve_runs(preset.effort), chosen_points()),
         Sheet("stability", "stability", stability_runs(preset.effort)),
         Sheet("views", "variants", {f"{r.options.scene.capture.update} photographs a visit": [r] for r in views}),
         Sheet("poses", "variants", {f"{r.options.scene.capture.pose_noise}° on given poses": [r] for r in poses}),
         Sheet("features", "variants", {f"{r.options.feature_noise} of a descriptor's norm": [r] for r in features}),
-        Sheet("hyperparameters", "variants", hyper),
+        Sheet("hyperparameters", "variants", hyper, own),
+        Sheet("presets", "variants", _whole(preset, scene), {preset.system: "this page"}),
     ]
 
 

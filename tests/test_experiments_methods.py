@@ -152,6 +152,7 @@ def test_sheets_name_every_method_and_no_run_twice_for_different_options():
         "views",
         "curves",
         "stability",
+        "presets",
     }
     comparison = every[0]
     assert {run.options.scene.capture.scene for runs in comparison.runs.values() for run in runs} == set(SCENES)
@@ -161,6 +162,24 @@ def test_sheets_name_every_method_and_no_run_twice_for_different_options():
             for run in runs:
                 assert configs.setdefault(run.name, run.config()) == run.config()
                 json.dumps(run.config())
+
+
+@pytest.mark.parametrize("preset", tables.PRESETS)
+def test_what_presets_chose_is_on_the_curves(preset):
+    every = {sheet.name: sheet for sheet in tables.sheets(tables.PRESETS[preset], tables.Options(preset=preset))}
+    curves = every["curves"]
+    assert set(curves.chosen) <= set(curves.runs)
+    assert {name.partition(": ")[0] for name in curves.chosen} == {name.partition(": ")[0] for name in curves.runs}
+    for name in ("ablation", "hyperparameters", "presets"):
+        assert set(every[name].chosen) & set(every[name].runs)
+
+
+def test_a_plot_rings_what_was_chosen(tmp_path):
+    points = [("a", 1.0, 2.0), ("b", 2.0, 1.0)]
+    plain, ringed = tmp_path / "plain.png", tmp_path / "ringed.png"
+    report.scatter(points, plain, "s", "dB")
+    report.scatter(points, ringed, "s", "dB", {"b": "fast"})
+    assert plain.read_bytes() != ringed.read_bytes()
 
 
 def test_an_unknown_preset_or_sheet_is_named():

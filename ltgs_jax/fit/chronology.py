@@ -281,19 +281,26 @@ def fit_chronology(
     fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, config=config, progress=progress)
     for leaf, new in zip(jax.tree.leaves(every), jax.tree.leaves(fitted.splats), strict=True):
         leaf[free] = np.asarray(new)
+    return _with_fitted(chronology, every, fixed, fitted), losses
+
+
+def _with_fitted(chronology: Chronology, every: Splats, fixed: _Fixed, fitted: _Variables) -> Chronology:
+    """The chronology with all its splats in one row, and poses, shades and shadows, as they came out."""
+    background, templates, placements = chronology.background, chronology.templates, fixed.placements
     ends = np.cumsum([background.count, *(m.splats.count for m in templates)])
     parts = [every[slice(a, b)] for a, b in zip([0, *ends[:-1]], ends, strict=True)]
     poses = (placements.poses @ SE3.exp(fitted.tangents))[placements.index]
     slopes = fitted.shades[:, 1:] / fixed.diameters[:, None]
     constants = fitted.shades[:, 0] - jnp.sum(slopes * fixed.frames[1 + placements.template, :3], axis=-1)
     shade = jnp.concatenate([constants[:, None], slopes], axis=-1)[placements.index]
-    fitted = eqx.tree_at(
+    shadows = eqx.tree_at(lambda s: s.log_gain, fixed.shadows, fitted.shadows)
+    fitted_chronology = eqx.tree_at(
         lambda c: (c.background, *(m.splats for m in c.templates), c.world_from_template, c.shade, c.shadows),
         chronology,
-        (*parts, poses, shade, eqx.tree_at(lambda s: s.log_gain, shadows, fitted.shadows)),
+        (*parts, poses, shade, shadows),
         is_leaf=lambda leaf: leaf is None,
     )
-    return jax.tree.map(jnp.asarray, fitted), losses
+    return jax.tree.map(jnp.asarray, fitted_chronology)
 
 
 def _shadows_of(chronology: Chronology, placements: Placements, frames: Float[np.ndarray, "k 4"]) -> Shadows:

@@ -3,7 +3,9 @@
 from .capture import Capture as Capture
 from .capture import Observations as Observations
 from .capture import read_capture as read_capture
+from .chronology import arrays_of as arrays_of
 from .chronology import load_chronology as load_chronology
+from .chronology import module_of as module_of
 from .chronology import save_chronology as save_chronology
 from .colmap import ColmapImage as ColmapImage
 from .colmap import ColmapModel as ColmapModel

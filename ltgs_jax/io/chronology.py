@@ -1,9 +1,14 @@
 """Chronologies on disk: chronology.safetensors holds everything, chronology.json says in words what is in it."""
 
+import dataclasses
 import json
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeVar
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
@@ -13,10 +18,25 @@ from ltgs_jax.scene import Chronology, Shadows, Splats, Template
 
 from .files import InputError, read_bytes, safe_name, write_bytes, write_json
 
+M = TypeVar("M", bound=eqx.Module)
+
 _VERSION = 1
-_SPLAT_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-_SHADOW_FIELDS = ("centers", "radii", "log_gain", "cast")
 _DTYPES = ("float32", "float64")
+
+
+def _keys(name: str, kind: type[eqx.Module]) -> list[str]:
+    """The arrays of a module of arrays, in order."""
+    return [f"{name}.{field.name}" for field in dataclasses.fields(kind)]
+
+
+def arrays_of(name: str, module: eqx.Module) -> dict[str, np.ndarray]:
+    """The arrays of a module that has nothing else, as `name.field`."""
+    return dict(zip(_keys(name, type(module)), map(np.asarray, jax.tree.leaves(module)), strict=True))
+
+
+def module_of(kind: type[M], name: str, arrays: Mapping[str, np.ndarray]) -> M:
+    """The module that `arrays_of` named."""
+    return kind(*(arrays[key] for key in _keys(name, kind)))
 
 
 def save_chronology(folder: str | Path, chronology: Chronology) -> None:
@@ -37,11 +57,11 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
     if chronology.shade is not None:
         arrays["shade"] = chronology.shade
     if chronology.shadows is not None:
-        arrays |= {f"shadows.{field}": getattr(chronology.shadows, field) for field in _SHADOW_FIELDS}
+        arrays |= arrays_of("shadows", chronology.shadows)
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
-        arrays |= {f"{name}.{field}": getattr(splats, field) for field in _SPLAT_FIELDS}
+        arrays |= arrays_of(name, splats)
     description = {
         "version": _VERSION,
         "visits": list(chronology.visits),
@@ -159,11 +179,12 @@ class _Taker:
         if k and math.isqrt(k[0]) ** 2 != k[0]:
             raise InputError(f"{self._path}: {name}.sh has {k[0]} coefficients")
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *k, 3))
-        return Splats(*(self(f"{name}.{field}", shape) for field, shape in zip(_SPLAT_FIELDS, shapes, strict=True)))
+        return Splats(*(self(key, shape) for key, shape in zip(_keys(name, Splats), shapes, strict=True)))
 
     def shadows(self, t: int) -> Shadows:
         """The shadows of t visits."""
         m = self._arrays["shadows.cast"].shape[-1:] or (0,)
         shapes = ((*m, 3), m, m)
-        arrays = [self(f"shadows.{field}", shape) for field, shape in zip(_SHADOW_FIELDS, shapes, strict=False)]
-        return Shadows(*arrays, self("shadows.cast", (t, *m), dtypes=("bool",)))
+        *keys, cast = _keys("shadows", Shadows)
+        arrays = [self(key, shape) for key, shape in zip(keys, shapes, strict=True)]
+        return Shadows(*arrays, self(cast, (t, *m), dtypes=("bool",)))

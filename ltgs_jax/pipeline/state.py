@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ltgs_jax.geometry import SE3
+from ltgs_jax.io import arrays_of, module_of
 from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, concatenate_splats
 from ltgs_jax.template import Support
 
@@ -206,25 +207,11 @@ def _is_none(leaf) -> bool:
     return leaf is None
 
 
-_SHADOW_FIELDS = ("centers", "radii", "log_gain", "cast")
-_FIELDS = ("means", "quats", "log_scales", "logit_opacities", "sh")
-
-
-def pack_splats(prefix: str, splats: Splats) -> dict[str, np.ndarray]:
-    """Arrays by name."""
-    return {f"{prefix}{field}": np.asarray(getattr(splats, field)) for field in _FIELDS}
-
-
-def unpack_splats(prefix: str, arrays: dict[str, np.ndarray]) -> Splats:
-    """The splats that `pack_splats` named."""
-    return Splats(**{field: arrays[f"{prefix}{field}"] for field in _FIELDS})
-
-
 def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
     """A state as arrays by name, and what JSON holds of it."""
     chronology = state.chronology
     arrays = {
-        **pack_splats("background.", chronology.background),
+        **arrays_of("background", chronology.background),
         "errors": state.errors,
         "guessed": state.guessed,
         "since": np.asarray(state.chronology.since),
@@ -235,9 +222,9 @@ def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
     if chronology.shade is not None:
         arrays["shade"] = np.asarray(chronology.shade)
     if chronology.shadows is not None:
-        arrays |= {f"shadows.{field}": np.asarray(getattr(chronology.shadows, field)) for field in _SHADOW_FIELDS}
+        arrays |= arrays_of("shadows", chronology.shadows)
     for k, template in enumerate(chronology.templates):
-        arrays |= pack_splats(f"template{k}.", template.splats)
+        arrays |= arrays_of(f"template{k}", template.splats)
         arrays[f"template{k}.errors"] = state.template_errors[k]
         support = state.supports[k]
         if support is not None:
@@ -249,16 +236,16 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
     """The state that `pack_state` named."""
     templates, errors, supports = [], [], []
     for k, (identity, source) in enumerate(notes["templates"]):
-        templates.append(Template(unpack_splats(f"template{k}.", arrays), identity, source))
+        templates.append(Template(module_of(Splats, f"template{k}", arrays), identity, source))
         errors.append(arrays[f"template{k}.errors"])
         packed = arrays.get(f"template{k}.support")
         supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
-    start = State.of_initial(unpack_splats("background.", arrays), arrays["errors"], visits)
+    start = State.of_initial(module_of(Splats, "background", arrays), arrays["errors"], visits)
     start = eqx.tree_at(lambda s: (s.guessed, s.chronology.since), start, (arrays["guessed"], arrays["since"]))
     poses = SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"]))
     state = _with_templates(
         start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)
     )
-    shadows = [arrays[f"shadows.{field}"] for field in _SHADOW_FIELDS] if "shadows.cast" in arrays else None
-    lit = (arrays.get("shade"), None if shadows is None else Shadows(*shadows))
+    shadows = module_of(Shadows, "shadows", arrays) if "shadows.cast" in arrays else None
+    lit = (arrays.get("shade"), shadows)
     return eqx.tree_at(lambda s: (s.chronology.shade, s.chronology.shadows), state, lit, is_leaf=_is_none)

@@ -19,6 +19,8 @@ from ltgs_jax.io import read_bytes, write_bytes, write_json
 
 T = TypeVar("T")
 
+_FORMAT = 2  # of what stages hold: none of another format is taken up
+
 
 def digest(*parts: Any) -> str:
     """A name for inputs: dataclasses, arrays, bytes and plain values, by content."""
@@ -52,7 +54,7 @@ class Store:
 
         `compute` returns arrays by name and notes that JSON can hold; notes["counts"] goes to stages.json.
         """
-        path = self.folder / f"{name}.safetensors"
+        path, key = self.folder / f"{name}.safetensors", digest(_FORMAT, key)
         self.progress.stage(name)
         found = _read(path, key)
         if found is not None:

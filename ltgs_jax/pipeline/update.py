@@ -23,8 +23,10 @@ from ltgs_jax.io import (
     Capture,
     InputError,
     Photograph,
+    arrays_of,
     load_image,
     load_mask,
+    module_of,
     read_bytes,
     read_capture,
     read_ply,
@@ -32,7 +34,7 @@ from ltgs_jax.io import (
     write_json,
 )
 from ltgs_jax.localize import Localization, localize
-from ltgs_jax.scene import Chronology
+from ltgs_jax.scene import Chronology, Splats
 
 from .config import Config, check_config
 from .evaluate import evaluate
@@ -41,7 +43,7 @@ from .looks import Eye, Observation, expected_errors
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
-from .state import Account, State, pack_splats, pack_state, scene_at, unpack_splats, unpack_state
+from .state import Account, State, pack_state, scene_at, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
 
@@ -229,10 +231,10 @@ def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye,
             ).splats
         progress.note("measuring what difference is to be expected")
         errors = expected_errors(eye, splats, views, front_end, gamma=config.detect.gamma)
-        return {**pack_splats("", splats), "errors": errors}, {"counts": {"splats": splats.count}}
+        return {**arrays_of("splats", splats), "errors": errors}, {"counts": {"splats": splats.count}}
 
     arrays, _ = store.run("initial", key, compute)
-    return unpack_splats("", arrays), arrays["errors"]
+    return module_of(Splats, "splats", arrays), arrays["errors"]
 
 
 def _observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observation]:
