@@ -146,7 +146,8 @@ def _window_splats(variables: _Variables, rows, ground_rows, visit, fixed: _Fixe
     along = (splats.means - fixed.frames[owner, :3]) / fixed.frames[owner, 3:]
     shadows = eqx.tree_at(lambda s: s.log_gain, fixed.shadows, variables.shadows)
     since = fixed.since.at[rows].get(mode="clip")
-    gain = jnp.where(owner == 0, ground_gain(shadows, splats.means, since, visit), shade[:, 0])
+    places = jax.lax.stop_gradient(splats.means)  # no splat is pulled into a shadow
+    gain = jnp.where(owner == 0, ground_gain(shadows, places, since, visit), shade[:, 0])
     lit = shade_splats(splats, gain + jnp.sum(shade[:, 1:] * along, axis=-1))
     moved = transform_splats(here, _hide_padding(lit, rows, fixed.owner.shape[0]), owner)
     ground = (fixed.ground, fixed.ground_since)

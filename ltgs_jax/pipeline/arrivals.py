@@ -19,6 +19,7 @@ from ltgs_jax.scene import Splats, Template, pad_splats, transform_splats
 from ltgs_jax.template import (
     Crop,
     Placement,
+    Search,
     Support,
     build_template,
     explained,
@@ -40,6 +41,7 @@ _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is 
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
 _COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
+_BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
@@ -242,36 +244,52 @@ def _placements(
     hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
     sizes = {k: template_diameter(state.chronology.templates[k].splats) for k in hidden}
     for i, arrival in enumerate(arrivals):
-        searches = {}
-        for k in hidden:
-            stood_on = state.supports[k]
-            if stood_on is None or not _sizes_agree(arrival.instance, sizes[k]):
-                continue
-            searches[k] = search_template(
-                state.chronology.templates[k],
-                stood_on,
-                arrival.support,
-                _places(arrival.instance.points, sizes[k]),
-                arrival.crop,
-                size=sizes[k],
-                refiner=eye.refiner,
-                rng=rng,
-                before=state.chronology.world_from_template[t - 1, k],
-                config=config.template,
-            )
+        searches = _searches(state, t, arrival, sizes, eye=eye, config=config, rng=rng)
         ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
-        for k in [k for k in ranked if searches[k].best_gain > config.template.tau_gain]:
+        least = config.template.tau_gain
+        for k in ranked:
             looks = {"size": sizes[k], "refiner": eye.refiner}
+            if searches[k].best_gain <= least:
+                continue
             if place_template(searches[k], searches[k].poses[0], arrival.crop, **looks).recall < _COVERED:
                 continue
-            found = settle_template(searches[k], arrival.crop, **looks)
-            placements[i, k] = found
+            found = placements[i, k] = settle_template(searches[k], arrival.crop, **looks)
+            if found.worth > config.template.tau_sure:
+                least = max(least, searches[k].best_gain - _BEHIND)
             identity = state.chronology.templates[k].identity
             progress.note(
                 f"visit {t}: arrival {i} as object {identity}: explains {found.gain:.2f}, "
                 f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}"
             )
     return placements
+
+
+def _searches(
+    state: State, t: int, arrival: Arrival, sizes: dict[int, float], *, eye: Eye, config: Config, rng
+) -> dict[int, Search]:
+    """Poses of the templates that have room in an arrival: upright, and, where none explains it so, on their other
+    sides."""
+
+    def search(k: int, upright: bool) -> Search:
+        return search_template(
+            state.chronology.templates[k],
+            state.supports[k],
+            arrival.support,
+            _places(arrival.instance.points, sizes[k]),
+            arrival.crop,
+            size=sizes[k],
+            refiner=eye.refiner,
+            rng=rng,
+            before=state.chronology.world_from_template[t - 1, k] if upright else None,
+            upright=upright,
+            config=config.template,
+        )
+
+    able = [k for k in sizes if state.supports[k] is not None and _sizes_agree(arrival.instance, sizes[k])]
+    found = {k: search(k, True) for k in able}
+    if all(each.best_gain <= config.template.tau_search for each in found.values()):
+        found = {k: max(each, search(k, False), key=lambda s: s.best_gain) for k, each in found.items()}
+    return found
 
 
 def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:

@@ -65,7 +65,7 @@ def turn_in_place(
         size = template_diameter(template.splats)
         search = search_template(
             template, support, support.moved(before), middle_of(points)[None], crop,
-            size=size, refiner=eye.refiner, rng=rng, before=before, upright=True, config=config.template,
+            size=size, refiner=eye.refiner, rng=rng, before=before, config=config.template,
         )  # fmt: skip
         if search.best_gain < config.template.tau_gain:
             continue

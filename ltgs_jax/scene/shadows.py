@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 _REACH = 3.0  # radii, beyond which a blob ends
+_AT_ONCE = 8192  # splats whose distances to all blobs are in memory
 
 
 class Shadows(eqx.Module):
@@ -27,12 +28,12 @@ def ground_gain(
     """Log of the gain on the colours of the ground's splats at visit t, beside visit `since`, whose shadows are in the
     colours already; exactly 0 where nothing came or left."""
 
-    def add(total, blob):
-        center, radius, log_gain, cast = blob
-        distance = jnp.sum(((means - center) / radius) ** 2, axis=-1)
-        weight = jnp.where(distance < _REACH**2, jnp.exp(-0.5 * distance), 0)
-        there, then = cast[t].astype(means.dtype), cast[since].astype(means.dtype)
-        return total + (there - then) * log_gain * weight, None
+    effects = (shadows.cast[t].astype(means.dtype) - shadows.cast.astype(means.dtype)) * shadows.log_gain
 
-    blobs = shadows.centers, shadows.radii, shadows.log_gain, shadows.cast.T
-    return jax.lax.scan(add, jnp.zeros_like(means[:, 0]), blobs)[0]
+    def effect(row):
+        mean, since = row
+        distance = sum(((mean[i] - shadows.centers[:, i]) / shadows.radii) ** 2 for i in range(3))
+        weights = jnp.where(distance < _REACH**2, jnp.exp(-0.5 * distance), 0)
+        return jnp.matmul(effects, weights, precision="highest")[since]
+
+    return jax.lax.map(effect, (means, since), batch_size=_AT_ONCE)

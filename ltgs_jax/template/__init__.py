@@ -1,6 +1,7 @@
 """Rank 4: the splats of each object, and where they stand."""
 
 from .arrival import Placement as Placement
+from .arrival import Search as Search
 from .arrival import build_template as build_template
 from .arrival import middle_of as middle_of
 from .arrival import place_template as place_template

@@ -169,13 +169,12 @@ def search_template(
     refiner: Refiner,
     rng: np.random.Generator,
     before: SE3 | None = None,
-    upright: bool = False,
+    upright: bool = True,
     config: TemplateConfig = TemplateConfig(),
 ) -> Search:
     """Poses at which a template, rendered at many turns and places on the support, looks like the photographs.
 
-    Upright first, and at its pose `before`; unless `upright`, on its other sides too if upright explains little. The
-    best two, best first.
+    Upright, and at its pose `before`; or, if not `upright`, on its other sides. The best two, best first.
 
     Coarse windows tell the right one of a template's poses, and not one template from another: at half the size even a
     box where it stands may explain nothing, and what is full of detail explains nothing a few degrees beside its pose.
@@ -186,30 +185,23 @@ def search_template(
     coarse = half_crop(crop)
     without, change = backdrop_error(crop)
     options = {"tolerance": 0.1 * size}
-    best: Search | None = None
-    for tilts, turns in (([np.eye(3)], config.yaw_steps), (tilts_of(stood_on), config.yaw_steps // 2)):
-        hypotheses = pose_hypotheses(points, stood_on, stands_on, places, turns=turns, spread=size, tilts=tilts)
-        if before is not None:
-            hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
-        scores, covered = refiner.score(lighter, hypotheses, coarse, **options)
-        # Behind what is known no pose is wrong, and none is right.
-        least = _IN_SIGHT * np.median(covered)
-        scores = np.where(covered < least, np.inf, scores)
-        chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
-        poses = refiner.slide(
-            lighter, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, least=least, rng=rng, **options
-        )
-        errors, _ = refiner.score(light, poses, crop, **options)
-        two = poses[np.argsort(errors, kind="stable")[:2]]
-        near = refiner.refine(light, two, crop, size=size, steps=6, blurred=3, **options)
-        order = np.argsort(near.errors, kind="stable")
-        found = Search(light, stood_on, stands_on, near.poses[order], near.errors[order], without, change)
-        if best is None or found.errors.min() < best.errors.min():
-            best = found
-        if upright or best.best_gain > config.tau_search:
-            break
-    assert best is not None
-    return best
+    tilts, turns = ([np.eye(3)], config.yaw_steps) if upright else (tilts_of(stood_on), config.yaw_steps // 2)
+    hypotheses = pose_hypotheses(points, stood_on, stands_on, places, turns=turns, spread=size, tilts=tilts)
+    if before is not None:
+        hypotheses = jax.tree.map(lambda a, b: jnp.concatenate([a, jnp.asarray(b)[None]]), hypotheses, before)
+    scores, covered = refiner.score(lighter, hypotheses, coarse, **options)
+    # Behind what is known no pose is wrong, and none is right.
+    least = _IN_SIGHT * np.median(covered)
+    scores = np.where(covered < least, np.inf, scores)
+    chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
+    poses = refiner.slide(
+        lighter, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, least=least, rng=rng, **options
+    )
+    errors, _ = refiner.score(light, poses, crop, **options)
+    two = poses[np.argsort(errors, kind="stable")[:2]]
+    near = refiner.refine(light, two, crop, size=size, steps=6, blurred=3, **options)
+    order = np.argsort(near.errors, kind="stable")
+    return Search(light, stood_on, stands_on, near.poses[order], near.errors[order], without, change)
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:

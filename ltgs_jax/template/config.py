@@ -40,7 +40,8 @@ class TemplateConfig:
     search_splats: int = 1024
     """Splats of a template while its pose is sought; half of them in small windows."""
     tau_search: float = 0.25
-    """Share of the change that an upright pose must explain in the search, before the object is laid on its sides."""
+    """Share of the change that some known template, upright, must explain in the search; else all are laid on their
+    other sides too."""
     tau_gain: float = -0.25
     """Share of the change that a known template must explain in the search, to be looked at closely; below 0 it looks
     worse than nothing, as at a wrong turn."""

@@ -128,6 +128,8 @@ _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as n
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
 _DARK, _TIMID, _GAIN = 0.05, 0.05, 0.7  # floor of ratios of colours; prior of a gain on nothing, and its most, in log
+_SCALE = 0.15  # of a residual, beyond which it counts for little
+_BLUR, _LOCAL = 1.5, 3.0  # pixels: of a descent's first steps; of the mean that greys lose
 _NARROWER = 0.7  # what is left of the width of parabolas from round to round
 
 
@@ -199,29 +201,24 @@ def backdrop_error(crop: Crop) -> tuple[float, float]:
     object is."""
     wrong = backdrop_unlikeness(crop)
     inside = np.where(np.asarray(crop.region), wrong, 0)
-    return float(_view_errors(wrong, crop).mean()), float(_view_errors(inside, crop).mean())
+    return tuple(float(_mean_errors(pixels[None], crop)[0]) for pixels in (wrong, inside))
 
 
 def backdrop_unlikeness(crop: Crop) -> Float[np.ndarray, "v s s"]:
     """How unlike the photographs each pixel is with nothing added to the backdrop."""
-    return _unlike_crop(np.asarray(crop.backdrop)[None], crop)[0]
+    return _unlike_crop(crop.backdrop, crop)
 
 
-def _unlike_crop(images: Float[np.ndarray, "m v s s 3"], crop: Crop) -> Float[np.ndarray, "m v s s"]:
-    return np.stack([unlikeness(image, crop.target, crop.valid) for image in images])  # one program for any m
+def _unlike_crop(images: Float[Array, "v s s 3"], crop: Crop) -> Float[np.ndarray, "v s s"]:
+    return np.asarray(unlikeness(images, crop.target, crop.valid))
 
 
 def explained(images: Float[np.ndarray, "v s s 3"], crop: Crop) -> tuple[float, float]:
     """Mean unlikeness with something added to the backdrop, and the share of the change that it explains; what is drawn
     beside the change counts against."""
     without, change = backdrop_error(crop)
-    error = float(_view_errors(_unlike_crop(images[None], crop), crop).mean())
+    error = float(_mean_errors(_unlike_crop(images, crop)[None], crop)[0])
     return error, (without - error) / max(change, 1e-9)
-
-
-def _view_errors(wrong: Float[np.ndarray, "*m v s s"], crop: Crop) -> Float[np.ndarray, "*m v"]:
-    """Mean unlikeness over the pixels that count."""
-    return np.sum(wrong, axis=(-2, -1)) / np.maximum(np.asarray(crop.valid).sum(axis=(1, 2)), 1)
 
 
 @eqx.filter_jit
@@ -237,11 +234,55 @@ def _composites(template: Splats, poses: SE3, crop: Crop, tolerance, plan: Rende
     return image + (1 - cover)[..., None] * crop.backdrop, cover, out.overflow
 
 
+@eqx.filter_jit
+def _judged(template: Splats, poses: SE3, crop: Crop, tolerance, plan: RenderPlan):
+    """Mean unlikeness at each of m poses, how many of the pixels that changed the template covers there, overflow."""
+    images, cover, overflow = _composites(template, poses, crop, tolerance, plan)
+    wrong = jax.vmap(unlikeness, (0, None, None))(images, crop.target, crop.valid)
+    return _mean_errors(wrong, crop), jnp.sum(cover * (crop.valid & crop.region), axis=(1, 2, 3)), overflow
+
+
+def _mean_errors(wrong: Float[Array, "m v s s"], crop: Crop) -> Float[Array, " m"]:
+    """Mean over views of the mean unlikeness of the pixels that count."""
+    return jnp.mean(jnp.sum(wrong, axis=(2, 3)) / jnp.maximum(jnp.sum(crop.valid, axis=(1, 2)), 1), axis=1)
+
+
+@eqx.filter_jit
+def _linearised(template: Splats, poses: SE3, crop: Crop, tolerance, smooth: Float[Array, "s s"], plan: RenderPlan):
+    """Of each of m poses, followed by its six probes: mean unlikeness, cost [m], and Gauss–Newton's matrix [m 6 6] and
+    slope [m 6] per step of a probe; overflow. `smooth` blurs the residuals along each axis."""
+    images, _, overflow = _composites(template, poses, crop, tolerance, plan)
+    images = images.reshape(-1, 7, *images.shape[1:])
+    wrong = jax.vmap(unlikeness, (0, None, None))(images[:, 0], crop.target, crop.valid)
+    residual = (images - crop.target) * crop.valid[..., None]
+    # Colours for where it stands; what is left of the greys without their local mean for the rest: that stays when the
+    # object is shaded otherwise.
+    grey = jnp.mean(residual, axis=-1, keepdims=True)
+    detail = grey - _smoothed(grey, jnp.asarray(_smoothing(crop.camera.width, _LOCAL)))
+    flat = _smoothed(jnp.concatenate([0.5 * residual, 2 * detail], axis=-1), smooth).reshape(len(images), 7, -1)
+    here, steps = flat[:, 0], flat[:, 1:] - flat[:, :1]
+    weighted = steps / (1 + (here / _SCALE) ** 2)[:, None] ** 2
+    cost = jnp.sum(_SCALE**2 * here**2 / (_SCALE**2 + here**2), axis=1)
+    curves = jnp.einsum("mip,mjp->mij", weighted, steps, precision="highest")
+    falls = jnp.einsum("mip,mp->mi", weighted, here, precision="highest")
+    return _mean_errors(wrong, crop), cost, curves, falls, overflow
+
+
+def _smoothing(size: int, sigma: float) -> Float[np.ndarray, "s s"]:
+    """The matrix that blurs a row of pixels by a Gaussian of `sigma` px, borders reflected."""
+    return ndimage.gaussian_filter1d(np.eye(size, dtype=np.float32), sigma, axis=0, truncate=2)
+
+
+def _smoothed(images: Float[Array, "*b s s c"], along: Float[Array, "s s"]) -> Float[Array, "*b s s c"]:
+    """Images blurred along rows and columns."""
+    return jnp.einsum("ij,...jkc,lk->...ilc", along, images, along, precision="highest")
+
+
 def overlap_of(images: Float[np.ndarray, "v s s 3"], covered: Bool[np.ndarray, "v s s"], crop: Crop) -> float:
     """Share of a template's outlines that nothing speaks against: they lie on what changed, or look no less like the
     photographs than without it. Pooled over the views that have a region; `images` are composites with it."""
     region, valid = np.asarray(crop.region), np.asarray(crop.valid)
-    fits = region | (_unlike_crop(images[None], crop)[0] < backdrop_unlikeness(crop) + _AS_GOOD)
+    fits = region | (_unlike_crop(images, crop) < backdrop_unlikeness(crop) + _AS_GOOD)
     used = covered & valid & region.any(axis=(1, 2), keepdims=True)
     return float(np.sum(used & fits) / max(np.sum(used), 1))
 
@@ -299,34 +340,37 @@ class Refiner:
         self, template: Splats, poses: SE3, crop: Crop, tolerance: float
     ) -> tuple[Float[np.ndarray, "m v s s 3"], Float[np.ndarray, "m v s s"]]:
         """Composites at every pose, and the template's visible alpha."""
-        count = poses.xyz.shape[0]
-        poses = poses[np.minimum(np.arange(next(b for b in (_FEW, _BATCH) if b >= count)), count - 1)]
-        key = (template.count, poses.xyz.shape[0], *crop.depth.shape)
-        plan = self._plans.get(key)
-        if plan is None:
-            plan = plan_render(template, posed(crop.camera, poses), slack=2.0)
-        while True:
-            images, cover, overflow = _composites(template, poses, crop, jnp.asarray(tolerance, jnp.float32), plan)
-            if int(overflow) == 0:
-                self._plans[key] = plan
-                return np.asarray(images)[:count], np.asarray(cover)[:count]
-            needed = plan_render(template, posed(crop.camera, poses), slack=1.5)
-            plan = RenderPlan(
-                max(plan.intersections, needed.intersections) * 3 // 2, max(plan.rounds, needed.rounds) * 3 // 2
-            )
+        return self._shown(_composites, template, poses, crop, tolerance)
 
     def score(
         self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`, and how many of the pixels that changed
         it covers there."""
-        m = poses.xyz.shape[0]
-        errors, covered = [], []
-        for start in range(0, m, _BATCH):
-            images, cover = self.images(template, poses[start : start + _BATCH], crop, tolerance)
-            errors.append(_view_errors(_unlike_crop(images, crop), crop).mean(axis=1))
-            covered.append(np.sum(cover * np.asarray(crop.valid & crop.region), axis=(1, 2, 3)))
-        return np.concatenate(errors), np.concatenate(covered)
+        poses, starts = jax.tree.map(np.asarray, poses), range(0, poses.xyz.shape[0], _BATCH)
+        parts = [self._shown(_judged, template, poses[i : i + _BATCH], crop, tolerance) for i in starts]
+        errors, covered = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return errors, covered
+
+    def _shown(
+        self, program, template: Splats, poses: SE3, crop: Crop, tolerance: float, *more
+    ) -> tuple[np.ndarray, ...]:
+        """What a program that renders all poses at once gives, with room for all their splats."""
+        count, poses = poses.xyz.shape[0], jax.tree.map(np.asarray, poses)
+        poses = poses[np.minimum(np.arange(next(b for b in (_FEW, _BATCH) if b >= count)), count - 1)]
+        key = (template.count, poses.xyz.shape[0], *crop.depth.shape)
+        plan = self._plans.get(key)
+        if plan is None:
+            plan = plan_render(template, posed(crop.camera, poses), slack=2.0)
+        while True:
+            *shown, overflow = program(template, poses, crop, jnp.asarray(tolerance, jnp.float32), *more, plan)
+            if int(overflow) == 0:
+                self._plans[key] = plan
+                return tuple(np.asarray(leaf)[:count] for leaf in shown)
+            needed = plan_render(template, posed(crop.camera, poses), slack=1.5)
+            plan = RenderPlan(
+                max(plan.intersections, needed.intersections) * 3 // 2, max(plan.rounds, needed.rounds) * 3 // 2
+            )
 
     def slide(
         self,
@@ -376,64 +420,43 @@ class Refiner:
         tolerance: float,
         steps: int,
         blurred: int = 0,
-        turning: Float[np.ndarray, "3"] | None = None,
     ) -> Refinement:
-        """Descend from each of m poses. `size`: the template's diameter in scene units; `turning`: the axis in the
-        template's frame about which alone it may turn, or None for all three.
+        """Descend from each of m poses, in all six freedoms. `size`: the template's diameter in scene units.
 
         Residuals are differences of colour and of grey detail with Geman–McClure weights (scale 0.15); the first
         `blurred` steps see them blurred, which widens the basin. A step that does not pay is taken back and damped
         more.
         """
-        m = poses.xyz.shape[0]
+        m, middle = poses.xyz.shape[0], _middle(template)
         delta = np.r_[np.full(3, 0.01 * size), np.full(3, 0.02)]
         probes = np.concatenate([np.zeros((1, 6)), np.diag(delta)])
+        width = crop.camera.width
+        smooth = _smoothing(width, _BLUR), np.eye(width, dtype=np.float32)
         damping = np.full(m, 1e-2)
         best = jax.tree.map(np.asarray, poses)
         best_cost, best_errors = np.full(m, np.inf), np.full(m, np.inf)
-        freedoms = freedoms_of(turning)
-        normal = np.zeros((m, 6, 6))
-        slope = np.zeros((m, 6))
+        normal, slope = np.zeros((m, 6, 6)), np.zeros((m, 6))
         trial = poses
-        middle = _middle(template)
-
-        valid = np.asarray(crop.valid)[None, None, ..., None]
-        target = np.asarray(crop.target)
         for step in range(steps):
             if step == blurred:
                 best_cost[:] = np.inf
-            blur = 1.5 if step < blurred else 0.0
-            spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), 7, axis=0), trial)
-            spread = _about(middle, spread, np.tile(probes, (m, 1)))
-            images, _ = self.images(template, spread, crop, tolerance)
-            images = images.reshape(m, 7, *images.shape[1:])
-            errors = _view_errors(_unlike_crop(images[:, 0], crop), crop).mean(axis=1)
-            residual = (images - target) * valid
-            # Colours for where it stands; what is left of the greys without their local mean for the rest: that
-            # stays when the object is shaded otherwise.
-            grey = residual.mean(axis=-1, keepdims=True)
-            detail = grey - ndimage.gaussian_filter(grey, (0, 0, 0, 3, 3, 0), truncate=2)
-            residual = np.concatenate([0.5 * residual, 2 * detail], axis=-1)
-            if blur:
-                residual = ndimage.gaussian_filter(residual, (0, 0, 0, blur, blur, 0), truncate=2)
-            flat = residual.reshape(m, 7, -1)
-            weight = 1 / (1 + (flat[:, 0] / 0.15) ** 2) ** 2
-            cost = np.sum(0.15**2 * flat[:, 0] ** 2 / (0.15**2 + flat[:, 0] ** 2), axis=1)
+            spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), len(probes), axis=0), trial)
+            spread = jax.tree.map(np.asarray, _about(middle, spread, np.tile(probes, (m, 1))))
+            looks = [
+                self._shown(_linearised, template, spread[i : i + _FEW], crop, tolerance, smooth[step >= blurred])
+                for i in range(0, m * len(probes), _FEW)
+            ]
+            errors, cost, curves, falls = (np.concatenate(part)[:m] for part in zip(*looks, strict=True))
             better = cost < best_cost
-            jacobian = (flat[:, 1:] - flat[:, :1]) / delta[:, None]
-            weighted = jacobian * weight[:, None]
-            new_normal = weighted @ np.swapaxes(jacobian, 1, 2)
-            new_slope = np.einsum("mjp,mp->mj", weighted, flat[:, 0])
-            normal = np.where(better[:, None, None], new_normal, normal)
-            slope = np.where(better[:, None], new_slope, slope)
+            normal = np.where(better[:, None, None], curves / delta[:, None] / delta, normal)
+            slope = np.where(better[:, None], falls / delta, slope)
             damping = np.where(better, np.maximum(damping / 4, 1e-4), damping * 6)
             best = _where(better, jax.tree.map(np.asarray, trial), best)
             best_cost, best_errors = np.where(better, cost, best_cost), np.where(better, errors, best_errors)
             scale = np.einsum("mii->mi", normal)
             scale = scale + 1e-9 * scale.max(axis=1, keepdims=True) + 1e-12
             system = normal + (damping[:, None] * scale)[:, :, None] * np.eye(6)
-            system, downhill = freedoms.T @ system @ freedoms, -(slope @ freedoms)
-            move = np.linalg.solve(system, downhill[..., None])[..., 0] @ freedoms.T
+            move = np.linalg.solve(system, -slope[..., None])[..., 0]
             # No step leaves the region in which a linearisation of pixels can mean anything.
             move[:, :3] = np.clip(move[:, :3], -0.15 * size, 0.15 * size)
             move[:, 3:] = np.clip(move[:, 3:], -0.3, 0.3)

@@ -8,6 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 from ltgs_jax.geometry import SE3
 
 _STEEP = 0.02  # what a steep plane counts for beside a level one: things hang on walls, but rarely
+_AT_ONCE = 1 << 20  # distances of points from planes
 _LEVEL = np.radians(15)  # by which a surface that things stand on, or the guess of what is up, may be off
 
 
@@ -81,30 +82,27 @@ def fit_support(
     spread = np.sqrt(np.average(np.sum((points - center) ** 2, axis=1), weights=weights))
     bound = 0.025 * spread
     reach = 0.2 * np.linalg.norm(np.ptp(above, axis=0)) + 2 * bound
-    probability = weights / weights.sum()
-    best_score, best = 0.0, None
-    for _ in range(trials):
-        a, b, c = points[rng.choice(len(points), 3, replace=False, p=probability)]
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length < 1e-9 * spread**2:
-            continue
-        normal /= length
-        if np.median((vantage.centers - a) @ normal) < 0:
-            normal = -normal
-        distance = (points - a) @ normal
-        inlier = np.sum(weights * np.maximum(0, 1 - (distance / bound) ** 2))
-        height = (above - a) @ normal
-        over = np.mean(height > -reach)
-        touch = np.exp(-0.5 * (np.quantile(height, 0.05) / reach) ** 2)
-        angle = np.arccos(np.clip(normal @ vantage.up, -1, 1))
-        level = max(_STEEP, np.exp(-0.5 * (angle / _LEVEL) ** 2))
-        score = inlier * over**2 * touch * level
-        if score > best_score:
-            best_score, best = score, (normal, a)
-    if best is None:
+    chosen = rng.choice(len(points), (trials, 3), p=weights / weights.sum())
+    a, b, c = np.moveaxis(points[chosen], 1, 0)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    sound = lengths > 1e-9 * spread**2  # one point drawn twice spans none
+    a, normals = a[sound], normals[sound] / lengths[sound, None]
+    normals *= np.where(np.median((vantage.centers - a[:, None]) @ normals[..., None], axis=1) < 0, -1, 1)
+    offsets = np.sum(normals * a, axis=1)
+    scores = np.zeros(len(a))
+    for part in np.array_split(np.arange(len(a)), 1 + len(a) * max(len(points), len(above)) // _AT_ONCE):
+        distance = points @ normals[part].T - offsets[part]
+        inlier = weights @ np.maximum(0, 1 - (distance / bound) ** 2)
+        height = above @ normals[part].T - offsets[part]
+        over = np.mean(height > -reach, axis=0)
+        touch = np.exp(-0.5 * (np.quantile(height, 0.05, axis=0) / reach) ** 2)
+        scores[part] = inlier * over**2 * touch
+    angle = np.arccos(np.clip(normals @ vantage.up, -1, 1))
+    scores *= np.maximum(_STEEP, np.exp(-0.5 * (angle / _LEVEL) ** 2))
+    if scores.max(initial=0) <= 0:
         return None
-    normal, a = best
+    normal, a = normals[scores.argmax()], a[scores.argmax()]
     for _ in range(3):
         near = np.abs((points - a) @ normal) < bound
         if near.sum() < 6:
