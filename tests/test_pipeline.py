@@ -208,14 +208,46 @@ def test_shreds_are_no_shape_to_hold_against_a_known_object():
     crop = SimpleNamespace(valid=np.ones((2, 40, 40), bool))
 
     def shape(*new: np.ndarray) -> float:
-        found = SimpleNamespace(outlines=np.stack([box, box]))
-        return _same_shape(found, SimpleNamespace(outlines=np.stack(new)), crop)
+        return _same_shape(np.stack([box, box]), SimpleNamespace(outlines=np.stack(new)), crop)
 
     assert shape(box, box) == 1
     assert np.isclose(shape(box, other), 1 / 3)
     assert shape(box, shreds) == 1
     assert shape(shreds, shreds) == 1
     assert np.isclose(shape(shreds, other), 1 / 3)
+
+
+def test_known_objects_side_by_side_have_the_shape_of_one_change():
+    from types import SimpleNamespace
+
+    from ltgs_jax.pipeline import Config
+    from ltgs_jax.pipeline.arrivals import _shapes
+    from ltgs_jax.template import Placement
+
+    left, right = np.zeros((2, 40, 40), bool), np.zeros((2, 40, 40), bool)
+    left[:, 5:25, 2:20] = True
+    right[:, 5:25, 20:38] = True
+    arrivals = [SimpleNamespace(crop=SimpleNamespace(valid=np.ones((2, 40, 40), bool)))] * 2
+    new = SimpleNamespace(outlines=left | right)
+
+    def found(outlines, **changes):
+        return Placement(
+            SE3.identity(),
+            0.1,
+            **({"gain": 0.3, "overlap": 1.0, "likeness": 0.7, "recall": 0.5} | changes),
+            outlines=outlines,
+        )
+
+    def shapes(placements):
+        return _shapes(placements, arrivals, lambda i: new, Config())
+
+    assert shapes({(0, 0): found(left)}) == {(0, 0): 0.5}
+    assert shapes({(0, 0): found(left), (0, 1): found(right)}) == {(0, 0): 1, (0, 1): 1}
+    # One of them is of another change, lies upon the first, or is no evidence itself.
+    assert shapes({(0, 0): found(left), (1, 1): found(right)}) == {(0, 0): 0.5, (1, 1): 0.5}
+    assert shapes({(0, 0): found(left), (0, 1): found(left | right)})[0, 0] == 0.5
+    assert shapes({(0, 0): found(left), (0, 1): found(right, gain=0.01)}) == {(0, 0): 0.5}
+    assert shapes({(0, 0): found(left, recall=1.0)}) == {}
 
 
 def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():

@@ -42,6 +42,7 @@ _BARED = 0.5  # share of what came, over which it lies where something that left
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
 _COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
 _BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
+_APART = 0.2  # share of the smaller of two outlines, up to which they may overlap and be of things side by side
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
@@ -152,11 +153,7 @@ def _place_known(
     def as_new(i: int) -> NewObject | None:
         return _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
 
-    for (i, k), found in list(placements.items()):
-        if not convincing(found, config) or found.worth > config.template.tau_sure:
-            continue
-        new = as_new(i)
-        shape = 1.0 if new is None else _same_shape(found, new, arrivals[i].crop)
+    for (i, k), shape in _shapes(placements, arrivals, as_new, config).items():
         if shape < config.template.tau_shape:
             identity = state.chronology.templates[k].identity
             progress.note(f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f}")
@@ -325,12 +322,33 @@ def _as_new(
     return NewObject(template, *firm_part(template.splats, arrival.crop), error, gain)
 
 
-def _same_shape(found: Placement, new: NewObject, crop: Crop) -> float:
-    """The least overlap (IoU) of a known template's outlines with those of the change as a new object, over the views
-    that show enough of it and in which the new one has a shape to compare; 1 where none has."""
+def _shapes(
+    placements: dict[tuple[int, int], Placement], arrivals: Sequence[Arrival], as_new, config: Config
+) -> dict[tuple[int, int], float]:
+    """Of each pair that is convincing and not sure, how far the template's outlines are those of the change as a new
+    object; or its outlines and those of another template that stands beside it, taken for one thing with it."""
+    good = {pair: found for pair, found in placements.items() if convincing(found, config)}
+    shapes = {}
+    for (i, k), found in good.items():
+        new = as_new(i) if found.worth <= config.template.tau_sure else None
+        if new is not None:
+            others = [other.outlines for (j, m), other in good.items() if j == i and m != k]
+            beside = [found.outlines | other for other in others if _apart(found.outlines, other)]
+            shapes[i, k] = max(_same_shape(either, new, arrivals[i].crop) for either in (found.outlines, *beside))
+    return shapes
+
+
+def _apart(a: Bool[np.ndarray, "v s s"], b: Bool[np.ndarray, "v s s"]) -> bool:
+    """Whether two outlines hardly overlap."""
+    return (a & b).sum() < _APART * min(a.sum(), b.sum())
+
+
+def _same_shape(outlines: Bool[np.ndarray, "v s s"], new: NewObject, crop: Crop) -> float:
+    """The least overlap (IoU) of outlines with those of a change as a new object, over the views that show enough of
+    it and in which the new one has a shape to compare; 1 where none has."""
     valid = np.asarray(crop.valid)
-    both = (found.outlines & new.outlines & valid).sum(axis=(1, 2))
-    either = ((found.outlines | new.outlines) & valid).sum(axis=(1, 2))
+    both = (outlines & new.outlines & valid).sum(axis=(1, 2))
+    either = ((outlines | new.outlines) & valid).sum(axis=(1, 2))
     enough = either > max(0.2 * either.max(), 8)
     judges = enough & [outline.sum() > _COMPACT * _hull_area(outline) for outline in new.outlines]
     return float(np.min(both[judges] / either[judges], initial=1.0))

@@ -34,6 +34,7 @@ _TURNS = 12  # in place, of what was found
 _ASIDE = 0.1  # of an object's size: half as far as a turn is tried to the sides of its place
 _WIDTH = np.r_[np.full(3, 0.02), np.full(3, 0.04)]  # in sizes and radians: where a pose is polished at first
 _ROUNDS = 6  # of polish
+_FINER = 0.35  # of that width, for what was polished for half of them
 _IN_SIGHT = 0.3  # of the pixels that the middle pose covers, from which on a pose is in sight
 _PARALLEL = np.radians(8)  # between the normals of two surfaces, up to which they are taken for parallel
 _LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other than this are taken for one
@@ -213,23 +214,27 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=0.1 * size, steps=12, blurred=3)
     first = found.poses[int(np.argmin(found.errors))]
     turned = _other_turns(search, first, crop, size=size, refiner=refiner)
-    poses = [_polished(search, pose, None, crop, size, refiner)[0] for pose in (first, turned[0], turned[1])]
+    half = _ROUNDS // 2
+    poses = [_polished(search, pose, None, crop, size, refiner, half)[0] for pose in (first, turned[0], turned[1])]
     lit = [place_template(search, pose, crop, size=size, refiner=refiner, lit=True) for pose in poses]
-    chosen = max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))
-    best = place_template(search, poses[chosen], crop, size=size, refiner=refiner)
+    chosen = poses[max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))]
+    chosen, _ = _polished(search, chosen, None, crop, size, refiner, _ROUNDS - half, width=_FINER)
+    best = place_template(search, chosen, crop, size=size, refiner=refiner)
     upright = levelled(best.world_from_template, search)
     if upright is None:
         return best
-    pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner)
+    pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
     if error > best.error * (1 + _LEVEL_MARGIN):
         return best
     return place_template(search, pose, crop, size=size, refiner=refiner)
 
 
-def _polished(search: Search, pose: SE3, turning, crop: Crop, size: float, refiner: Refiner) -> tuple[SE3, float]:
+def _polished(
+    search: Search, pose: SE3, turning, crop: Crop, size: float, refiner: Refiner, rounds: int, *, width: float = 1.0
+) -> tuple[SE3, float]:
     """A pose [] where the unlikeness is least nearby, and that."""
-    freedoms = freedoms_of(turning) * (_WIDTH * np.r_[np.full(3, size), np.ones(3)])[:, None]
-    found = refiner.polish(search.template, pose[None], crop, freedoms, tolerance=0.1 * size, rounds=_ROUNDS)
+    freedoms = freedoms_of(turning) * (width * _WIDTH * np.r_[np.full(3, size), np.ones(3)])[:, None]
+    found = refiner.polish(search.template, pose[None], crop, freedoms, tolerance=0.1 * size, rounds=rounds)
     return found.poses[0], float(found.errors[0])
 
 

@@ -122,7 +122,8 @@ def posed(cameras: Camera, world_from_template: SE3) -> Camera:
     return Camera(tile.cam_from_world @ spread, tile.K, cameras.width, cameras.height)
 
 
-_FEW, _BATCH = 14, 64  # poses rendered in one call: of a descent (two with their probes), of a search
+_BATCH = 14  # poses rendered in one call: two with the six probes of a descent
+_AT_ONCE = 9  # such calls in one, of a search on other devices than CPUs
 _BEAM = ((32, 4), (16, 8), (8, 8), (6, 10), (6, 10), (6, 10))  # poses that a search follows, and steps around each
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
@@ -345,10 +346,12 @@ class Refiner:
     def score(
         self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Mean unlikeness at each of m poses, rendered in batches of `_BATCH`, and how many of the pixels that changed
-        it covers there."""
-        poses, starts = jax.tree.map(np.asarray, poses), range(0, poses.xyz.shape[0], _BATCH)
-        parts = [self._shown(_judged, template, poses[i : i + _BATCH], crop, tolerance) for i in starts]
+        """Mean unlikeness at each of m poses, rendered in batches, and how many of the pixels that changed it covers
+        there."""
+        few = poses.xyz.shape[0] <= _BATCH or jax.default_backend() == "cpu"
+        step = _BATCH if few else _AT_ONCE * _BATCH
+        poses, starts = jax.tree.map(np.asarray, poses), range(0, poses.xyz.shape[0], step)
+        parts = [self._shown(_judged, template, poses[i : i + step], crop, tolerance) for i in starts]
         errors, covered = (np.concatenate(part) for part in zip(*parts, strict=True))
         return errors, covered
 
@@ -357,7 +360,8 @@ class Refiner:
     ) -> tuple[np.ndarray, ...]:
         """What a program that renders all poses at once gives, with room for all their splats."""
         count, poses = poses.xyz.shape[0], jax.tree.map(np.asarray, poses)
-        poses = poses[np.minimum(np.arange(next(b for b in (_FEW, _BATCH) if b >= count)), count - 1)]
+        whole = _BATCH if count <= _BATCH else _AT_ONCE * _BATCH
+        poses = poses[np.minimum(np.arange(whole), count - 1)]
         key = (template.count, poses.xyz.shape[0], *crop.depth.shape)
         plan = self._plans.get(key)
         if plan is None:
@@ -443,8 +447,8 @@ class Refiner:
             spread = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), len(probes), axis=0), trial)
             spread = jax.tree.map(np.asarray, _about(middle, spread, np.tile(probes, (m, 1))))
             looks = [
-                self._shown(_linearised, template, spread[i : i + _FEW], crop, tolerance, smooth[step >= blurred])
-                for i in range(0, m * len(probes), _FEW)
+                self._shown(_linearised, template, spread[i : i + _BATCH], crop, tolerance, smooth[step >= blurred])
+                for i in range(0, m * len(probes), _BATCH)
             ]
             errors, cost, curves, falls = (np.concatenate(part)[:m] for part in zip(*looks, strict=True))
             better = cost < best_cost

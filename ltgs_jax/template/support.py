@@ -9,6 +9,7 @@ from ltgs_jax.geometry import SE3
 
 _STEEP = 0.02  # what a steep plane counts for beside a level one: things hang on walls, but rarely
 _AT_ONCE = 1 << 20  # distances of points from planes
+_ENOUGH = 500  # points that say on which side of a plane an object is
 _LEVEL = np.radians(15)  # by which a surface that things stand on, or the guess of what is up, may be off
 
 
@@ -82,6 +83,7 @@ def fit_support(
     spread = np.sqrt(np.average(np.sum((points - center) ** 2, axis=1), weights=weights))
     bound = 0.025 * spread
     reach = 0.2 * np.linalg.norm(np.ptp(above, axis=0)) + 2 * bound
+    above = above[:: max(1, len(above) // _ENOUGH)]
     chosen = rng.choice(len(points), (trials, 3), p=weights / weights.sum())
     a, b, c = np.moveaxis(points[chosen], 1, 0)
     normals = np.cross(b - a, c - a)
