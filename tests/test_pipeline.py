@@ -221,33 +221,25 @@ def test_known_objects_side_by_side_have_the_shape_of_one_change():
     from types import SimpleNamespace
 
     from ltgs_jax.pipeline import Config
-    from ltgs_jax.pipeline.arrivals import _shapes
+    from ltgs_jax.pipeline.arrivals import _shape_beside
     from ltgs_jax.template import Placement
 
     left, right = np.zeros((2, 40, 40), bool), np.zeros((2, 40, 40), bool)
     left[:, 5:25, 2:20] = True
     right[:, 5:25, 20:38] = True
-    arrivals = [SimpleNamespace(crop=SimpleNamespace(valid=np.ones((2, 40, 40), bool)))] * 2
+    crop = SimpleNamespace(valid=np.ones((2, 40, 40), bool))
     new = SimpleNamespace(outlines=left | right)
 
-    def found(outlines, **changes):
-        return Placement(
-            SE3.identity(),
-            0.1,
-            **({"gain": 0.3, "overlap": 1.0, "likeness": 0.7, "recall": 0.5} | changes),
-            outlines=outlines,
-        )
+    def found(outlines, gain: float = 0.3) -> Placement:
+        return Placement(SE3.identity(), 0.1, gain, overlap=1.0, likeness=0.7, recall=0.5, outlines=outlines)
 
-    def shapes(placements):
-        return _shapes(placements, arrivals, lambda i: new, Config())
+    def shape(*others: Placement) -> float:
+        return _shape_beside(found(left), others, new, crop, Config())
 
-    assert shapes({(0, 0): found(left)}) == {(0, 0): 0.5}
-    assert shapes({(0, 0): found(left), (0, 1): found(right)}) == {(0, 0): 1, (0, 1): 1}
-    # One of them is of another change, lies upon the first, or is no evidence itself.
-    assert shapes({(0, 0): found(left), (1, 1): found(right)}) == {(0, 0): 0.5, (1, 1): 0.5}
-    assert shapes({(0, 0): found(left), (0, 1): found(left | right)})[0, 0] == 0.5
-    assert shapes({(0, 0): found(left), (0, 1): found(right, gain=0.01)}) == {(0, 0): 0.5}
-    assert shapes({(0, 0): found(left, recall=1.0)}) == {}
+    assert shape() == 0.5
+    assert shape(found(right)) == 1
+    assert shape(found(left | right)) == 0.5  # it lies upon the first
+    assert shape(found(right, gain=0.01)) == 0.5  # it is no evidence itself
 
 
 def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():

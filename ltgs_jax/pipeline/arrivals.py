@@ -153,10 +153,17 @@ def _place_known(
     def as_new(i: int) -> NewObject | None:
         return _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
 
-    for (i, k), shape in _shapes(placements, arrivals, as_new, config).items():
-        if shape < config.template.tau_shape:
+    looked_at = dict(placements)
+    for (i, k), found in _unsure(looked_at, config).items():
+        new, others = as_new(i), [other for (j, m), other in looked_at.items() if j == i and m != k]
+        if new is None:
+            continue
+        shape = _shape_beside(found, others, new, arrivals[i].crop, config)
+        share = found.gain / min(max(new.gain, 1e-3), 1)
+        if shape < config.template.tau_shape or share < config.template.tau_share:
             identity = state.chronology.templates[k].identity
-            progress.note(f"visit {t}: arrival {i} is not object {identity}: their outlines overlap by {shape:.2f}")
+            what = f"outlines overlap by {shape:.2f}, and it explains {share:.2f} of what a new object would"
+            progress.note(f"visit {t}: arrival {i} is not object {identity}: their {what}")
             del placements[i, k]
     accounts, known, rest = [], [], []
     for i, k in _assigned(len(arrivals), placements, config):
@@ -322,20 +329,23 @@ def _as_new(
     return NewObject(template, *firm_part(template.splats, arrival.crop), error, gain)
 
 
-def _shapes(
-    placements: dict[tuple[int, int], Placement], arrivals: Sequence[Arrival], as_new, config: Config
-) -> dict[tuple[int, int], float]:
-    """Of each pair that is convincing and not sure, how far the template's outlines are those of the change as a new
-    object; or its outlines and those of another template that stands beside it, taken for one thing with it."""
-    good = {pair: found for pair, found in placements.items() if convincing(found, config)}
-    shapes = {}
-    for (i, k), found in good.items():
-        new = as_new(i) if found.worth <= config.template.tau_sure else None
-        if new is not None:
-            others = [other.outlines for (j, m), other in good.items() if j == i and m != k]
-            beside = [found.outlines | other for other in others if _apart(found.outlines, other)]
-            shapes[i, k] = max(_same_shape(either, new, arrivals[i].crop) for either in (found.outlines, *beside))
-    return shapes
+def _unsure(placements: dict[tuple[int, int], Placement], config: Config) -> dict[tuple[int, int], Placement]:
+    """The pairs that are convincing, but not beyond doubt."""
+    return {
+        pair: found
+        for pair, found in placements.items()
+        if convincing(found, config) and found.worth <= config.template.tau_sure
+    }
+
+
+def _shape_beside(found: Placement, others: Sequence[Placement], new: NewObject, crop: Crop, config: Config) -> float:
+    """How far a template's outlines are those of the change as a new object; or its outlines and those of another that
+    is convincing and stands beside it, taken for one thing with it."""
+    beside = [
+        other.outlines for other in others if convincing(other, config) and _apart(found.outlines, other.outlines)
+    ]
+    every = found.outlines, *(found.outlines | outlines for outlines in beside)
+    return max(_same_shape(outlines, new, crop) for outlines in every)
 
 
 def _apart(a: Bool[np.ndarray, "v s s"], b: Bool[np.ndarray, "v s s"]) -> bool:

@@ -51,8 +51,10 @@ class TemplateConfig:
     """Share of the change explained, times structural likeness, times recall (the share of what changed clearly that
     its outlines cover), from which on a known template is what came."""
     tau_sure: float = 0.2
-    """The same product, from which on the outlines need not be compared."""
+    """The same product, from which on it need not be compared with a new object."""
     tau_shape: float = 0.5
     """Least overlap (IoU), over views, of a known template's outlines with those of the change as a new object."""
+    tau_share: float = 0.2
+    """Share of what a new object would explain that a known template, if it is not sure, must explain."""
     tau_outline: float = 0.75
     """Least share of a known template's outlines that nothing in the photographs speaks against."""
