@@ -150,9 +150,9 @@ def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
             [[point, f"{row['seconds_ratio']:.3g}", f"{row['error']:.3g}"] for point, row in points],
         )
         triples = [(point, row["seconds_ratio"], row["error"]) for point, row in points]
-        chosen = {point: sheet.chosen.get(f"{curve}: {point}", "") for point, _ in points}
+        chosen = {name.removeprefix(f"{curve}: "): presets for name, presets in sheet.chosen.items()}
         path = images / f"results_curve_{curve.replace(' ', '_')}.png"
-        text += scatter(triples, path, "CPU time / control", what, {k: v for k, v in chosen.items() if v})
+        text += scatter(triples, path, "CPU time / control", what, chosen)
     return text
 
 

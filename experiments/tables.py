@@ -158,8 +158,8 @@ def _variants(preset: Preset, scene: str, changes: dict[str, tuple[tuple[str, fl
 def _whole(preset: Preset, scene: str) -> dict[str, list[Run]]:
     """The whole system from the first visit on at each preset that is no dearer than this page's, the photographs at
     this page's size."""
-    runs = {}
-    for name in ("tiny", "fast", "paper")[: ("tiny", "fast", "paper").index(preset.system) + 1]:
+    runs, names = {}, ["tiny", "fast", "paper"]
+    for name in names[: names.index(preset.system) + 1]:
         base = vary(preset.scene, "capture.scene", scene)
         if name != preset.system:
             base = dataclasses.replace(base, initial=for_small_photographs(SYSTEM_PRESETS[name]).fit.initial)
