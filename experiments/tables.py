@@ -192,6 +192,7 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 6))
     poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
     features = grid(_SYSTEM, base, feature_noise=(0.0, 0.3, 1.0))
+    depths = grid(_SYSTEM, base, depth_noise=(0.0, 0.03, 0.1))
     own = {"as it is": preset.system, "full": preset.system}
     hyper = _variants(preset, scene, {"as it is": ()})
     for name, values in HYPERPARAMETERS.items():
@@ -204,6 +205,7 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
         Sheet("views", "variants", {f"{r.options.scene.capture.update} photographs a visit": [r] for r in views}),
         Sheet("poses", "variants", {f"{r.options.scene.capture.pose_noise}° on given poses": [r] for r in poses}),
         Sheet("features", "variants", {f"{r.options.feature_noise} of a descriptor's norm": [r] for r in features}),
+        Sheet("depths", "variants", {f"{r.options.depth_noise:.0%} of the depth": [r] for r in depths}),
         Sheet("hyperparameters", "variants", hyper, own),
         Sheet("presets", "variants", _whole(preset, scene), {preset.system: "this page"}),
     ]

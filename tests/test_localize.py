@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ltgs_jax.io import InputError, read_capture
-from ltgs_jax.localize import LocalizeConfig, localize
+from ltgs_jax.localize import LocalizeConfig, align_later, localize
 from ltgs_jax.localize.tracks import join_tracks, triangulate
 
 _SIZE = (320, 240)
@@ -193,6 +193,35 @@ def test_retrieval_bounds_the_map(tmp_path, scene):
     assert sum(s.status == "localized" for s in result.photographs) == 3
 
 
+def _view_of(textures=None):
+    """Image, depth and alpha of the corner to any camera."""
+
+    def view(camera):
+        pose = np.asarray(camera.cam_from_world.as_matrix(), np.float64)[:3]
+        image, depth = _cast(pose, float(camera.K[0, 0]), (camera.width, camera.height), textures)
+        covered = np.isfinite(depth)
+        return image.astype(np.float32) / 255, np.where(covered, depth, 0), covered.astype(np.float32)
+
+    return view
+
+
+def test_a_rough_given_pose_is_held_against_renders_and_the_others_stay(tmp_path, scene):
+    rough = dict(scene)
+    pixels, pose, focal = scene["b/1.png"]
+    turn = cv2.Rodrigues(np.array([0.015, -0.015, 0.01]))[0]
+    rough["b/1.png"] = (pixels, turn @ pose + np.array([[0, 0, 0, 0.02]] * 3), focal)
+    capture = read_capture(_write(tmp_path, rough, given=set(rough)))
+    before = localize(capture)
+    after = align_later(capture, before, _view_of())
+    status = {s.name: s for s in after.photographs}
+    assert [name for name in sorted(status) if status[name].status != "given"] == ["b/1.png"]
+    assert status["b/1.png"].status == "localized" and status["b/1.png"].inliers > 100
+    assert _error(before.cameras["b/1.png"], pose)[0] > 1
+    degrees, distance = _error(after.cameras["b/1.png"], pose)
+    assert degrees < 0.1 and distance < 0.01
+    assert all(after.cameras[name] is before.cameras[name] for name in status if name != "b/1.png")
+
+
 def test_what_features_cannot_place_is_aligned_with_renders(tmp_path):
     textures = tuple(cv2.GaussianBlur(_texture(seed), (0, 0), 6) for seed in (1, 2))
     textures = tuple(cv2.normalize(texture, None, 40, 220, cv2.NORM_MINMAX) for texture in textures)
@@ -204,15 +233,10 @@ def test_what_features_cannot_place_is_aligned_with_renders(tmp_path):
     scene["b/0.png"] = (_render(near, textures=textures), near, _FOCAL)
     capture = read_capture(_write(tmp_path, scene, given={name for name in scene if name[0] == "a"}))
 
-    def view(camera):
-        pose = np.asarray(camera.cam_from_world.as_matrix(), np.float64)[:3]
-        image, depth = _cast(pose, float(camera.K[0, 0]), (camera.width, camera.height), textures)
-        covered = np.isfinite(depth)
-        return image.astype(np.float32) / 255, np.where(covered, depth, 0), covered.astype(np.float32)
-
     config = LocalizeConfig(tilts=(), min_ratio=2.0)  # a ratio that no feature matches reach
-    assert localize(capture, config=config).photographs[-1].status == "rejected"
-    result = localize(capture, config=config, render_view=view)
+    found = localize(capture, config=config)
+    assert found.photographs[-1].status == "rejected"
+    result = align_later(capture, found, _view_of(textures), config=config)
     assert result.photographs[-1].status == "localized" and result.photographs[-1].inliers >= 20
     degrees, distance = _error(result.cameras["b/0.png"], near)
     assert degrees < 0.5 and distance < 0.05

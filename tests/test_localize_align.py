@@ -3,12 +3,10 @@
 import cv2
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from ltgs_jax.geometry import SE3, Camera
-from ltgs_jax.localize import align_photograph, splat_view
-from ltgs_jax.scene import Splats
+from ltgs_jax.localize import align_photograph, correct_pose
 
 _K = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
 _SHAPE = (120, 160)
@@ -88,16 +86,16 @@ def test_alignment_of_another_place_does_not_agree():
     assert align_photograph(other, _K, [], _bumpy_plane) is None
 
 
-def test_splat_view_shows_the_splats():
-    camera = Camera(SE3.identity(), jnp.asarray(_K, jnp.float32), _SHAPE[1], _SHAPE[0])
-    splats = Splats(
-        means=jnp.asarray([[0.0, 0.0, 2.0]]),
-        quats=jnp.asarray([[1.0, 0, 0, 0]]),
-        log_scales=jnp.log(jnp.full((1, 3), 0.2)),
-        logit_opacities=jnp.asarray([4.0]),
-        sh=jnp.full((1, 1, 3), 1.0),
-    )
-    image, depth, alpha = splat_view(splats)(camera)
-    assert image.shape == (*_SHAPE, 3)
-    assert depth[60, 80] == pytest.approx(2.0, rel=1e-4)
-    assert alpha[60, 80] > 0.9 and alpha[5, 5] == 0
+def test_a_rough_pose_is_mended():
+    found = correct_pose(_photograph(), _K, _off(1.5, 0.03), _bumpy_plane)
+    degrees, distance = _errors(found.cam_from_world)
+    assert degrees < 0.3 and distance < 0.02
+
+
+def test_a_right_pose_stays():
+    assert correct_pose(_photograph(), _K, _off(0.05, 0.002), _bumpy_plane) is None
+
+
+def test_a_pose_is_kept_where_nothing_agrees():
+    other = np.ascontiguousarray(np.flipud(np.fliplr(_photograph())))
+    assert correct_pose(other, _K, _pose(), _bumpy_plane) is None

@@ -76,7 +76,7 @@ def test_every_file_of_the_contract_is_there(run, capture):
         assert (run / "splats" / f"{capture.name}_{t:04d}.ply").is_file()
     assert not (run / ".running").exists()
     stages = read_json(run / "stages.json", list)
-    assert [row["stage"] for row in stages][:2] == ["localize", "initial"]
+    assert [row["stage"] for row in stages][:3] == ["localize", "initial", "align"]
     assert all(row["status"] == "done" for row in stages)
 
 

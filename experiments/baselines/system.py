@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from experiments.engine import vary
+from experiments.eyes import NoisyDepth
 from experiments.front_ends import Noisy
 from experiments.scenes import SceneConfig, bytes_of, initial_scene, load_problem, per_visit_answer, score
 from ltgs_jax.io import load_chronology
@@ -37,6 +38,8 @@ class SystemConfig:
     """(dotted name, value) of options of `ltgs update` that differ from the preset."""
     feature_noise: float = 0.0
     """Standard deviation of noise on every dense descriptor, relative to its norm."""
+    depth_noise: float = 0.0
+    """Standard deviation of smooth noise on rendered depths, relative to them."""
     seed: int = 0
 
     @property
@@ -66,13 +69,15 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
         options = vary(options, path, value)
     out = folder / "chronology"
     kept = cache / "stages" / f"{problem.folder.name}_{config.preset}_{config.seed}_{initial_path.parent.name}"
-    if kept.is_dir() and not out.exists() and config.feature_noise == 0:
+    undisturbed = config.feature_noise == config.depth_noise == 0
+    if kept.is_dir() and not out.exists() and undisturbed:
         shutil.copytree(kept, out / "stages")
     noise = {"front_end": Noisy(sigma=config.feature_noise)} if config.feature_noise > 0 else {}
+    noise |= {"eye": NoisyDepth(config.depth_noise)} if config.depth_noise > 0 else {}
     chronology = update(
         problem.folder, out, config=options, initial=initial_path, seed=config.seed, progress=Silent(), **noise
     )
-    if not config.overrides and not kept.exists() and config.feature_noise == 0:
+    if not config.overrides and not kept.exists() and undisturbed:
         shutil.copytree(out / "stages", kept)
     said = {m["key"]: m["value"] for m in json.loads((out / "metrics.json").read_text()) if m["visit"] is None}
     scenes = [drop_hidden(compose(chronology, t)) for t in range(len(problem.visits))]

@@ -3,8 +3,9 @@
 from .align import Alignment as Alignment
 from .align import RenderView as RenderView
 from .align import align_photograph as align_photograph
-from .align import splat_view as splat_view
+from .align import correct_pose as correct_pose
 from .place import localize as localize
+from .renders import align_later as align_later
 from .structure import Structure as Structure
 from .structure import StructureConfig as StructureConfig
 from .structure import choose_pairs as choose_pairs

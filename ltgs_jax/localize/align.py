@@ -13,14 +13,15 @@ import numpy as np
 from jaxtyping import Float
 
 from ltgs_jax.geometry import SE3, Camera
-from ltgs_jax.render import render
-from ltgs_jax.scene import Splats
 
 RenderView = Callable[[Camera], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """Camera -> image [h w 3] in [0, 1], depth [h w] camera z, alpha [h w]."""
 
 _FINEST_PX = 320  # longer side of the finest level
 _PATCH_PX = 16
+_ROUGH_PX = 0.5  # at the finest level, up to which a pose is as good as alignment makes it
+_BETTER = 0.9  # of what a pose leaves uncorrelated, below which another one is better
+_AS_MANY = 0.9  # of the patches that agreed, which must agree still
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,16 +33,6 @@ class Alignment:
     agreeing: int
     textured: int
     correlation: float
-
-
-def splat_view(splats: Splats) -> RenderView:
-    """The renderer of a splat scene, as alignment wants it."""
-
-    def view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        output = render(splats, camera)
-        return np.asarray(output.image), np.asarray(output.depth), np.asarray(output.alpha)
-
-    return view
 
 
 def _flattened(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
@@ -123,7 +114,7 @@ def _level(image, K, pose, render_view: RenderView, *, shrink: float, rounds: in
     """Render, align, render again, at one size."""
     photo, at_size = _resized(image, K, shrink)
     for _ in range(rounds):
-        values, points = _rendered(at_size, pose, photo.shape, render_view)
+        values, points = _rendered(image, K, pose, photo.shape, render_view)
         if len(points) < 50:
             return pose
         pose = _steps(photo, at_size, values, points, pose, iterations=20)
@@ -137,21 +128,30 @@ def _resized(image, K, shrink: float) -> tuple[Float[np.ndarray, "h w"], Float[n
     return _flattened(scaled), K * np.array([[size[0] / width], [size[1] / height], [1.0]])
 
 
-def _rendered(K, pose, shape, render_view: RenderView) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
-    """Flattened values and world points of the pixels that a render covers."""
-    image, depth, alpha = render_view(_camera(pose, K, shape[1], shape[0]))
+def _view(image, K, pose, shape, render_view: RenderView):
+    """Image, depth and alpha rendered at the size of the photograph, for which one program serves, and reduced."""
+    rendered = render_view(_camera(pose, K, image.shape[1], image.shape[0]))
+    ways = cv2.INTER_AREA, cv2.INTER_NEAREST, cv2.INTER_AREA  # depths on both sides of an edge have no mean
+    return [cv2.resize(a, shape[::-1], interpolation=way) for a, way in zip(rendered, ways, strict=True)]
+
+
+def _rendered(
+    image, K, pose, shape, render_view: RenderView
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Flattened values and world points of the pixels of a reduced size that a render covers."""
+    view, depth, alpha = _view(image, K, pose, shape, render_view)
     covered = (alpha > 0.5) & (depth > 0)
     rows, columns = np.nonzero(covered)
-    pixels = np.stack([columns, rows], axis=1) + 0.5
+    pixels = (np.stack([columns, rows], axis=1) + 0.5) * (np.array(image.shape[1::-1]) / shape[::-1])
     local = np.concatenate([(pixels - K[:2, 2]) / np.diag(K)[:2], np.ones((len(pixels), 1))], axis=1)
     world = (local * depth[covered][:, None] - pose[:, 3]) @ pose[:, :3]
-    return _flattened(image)[covered], world
+    return _flattened(view)[covered], world
 
 
 def _score(image, K, pose, render_view: RenderView, *, shrink: float) -> Alignment:
     """How well a render at the pose looks like the photograph."""
-    photo, at_size = _resized(image, K, shrink)
-    view, _, alpha = render_view(_camera(pose, at_size, photo.shape[1], photo.shape[0]))
+    photo, _ = _resized(image, K, shrink)
+    view, _, alpha = _view(image, K, pose, photo.shape, render_view)
     other, covered = _flattened(view), alpha > 0.5
     agreeing = textured = 0
     for top in range(0, photo.shape[0] - _PATCH_PX + 1, _PATCH_PX):
@@ -165,6 +165,39 @@ def _score(image, K, pose, render_view: RenderView, *, shrink: float) -> Alignme
     if covered.sum() > 50 and min(photo[covered].std(), other[covered].std()) > 0:
         correlation = float(np.corrcoef(photo[covered], other[covered])[0, 1])
     return Alignment(pose, agreeing, textured, correlation)
+
+
+def correct_pose(
+    image: Float[np.ndarray, "h w 3"],
+    K: Float[np.ndarray, "3 3"],
+    cam_from_world: Float[np.ndarray, "3 4"],
+    render_view: RenderView,
+) -> Alignment | None:
+    """A better pose than the one that came with a photograph; None where the two show the same within half a pixel (at
+    320 px), or a render at the new one looks no more like the photograph.
+
+    Args as of `align_photograph`. Not differentiable.
+    """
+    finest = min(1.0, _FINEST_PX / max(image.shape[:2]))
+    pose = cam_from_world
+    for shrink in (finest / 4, finest / 2, finest):
+        photo, at_size = _resized(image, K, shrink)
+        values, points = _rendered(image, K, pose, photo.shape, render_view)
+        if len(points) < 50:
+            return None
+        pose = _steps(photo, at_size, values, points, pose, iterations=20)
+        before, after = (_projected(at_size, each, points) for each in (cam_from_world, pose))
+        shift = float(np.median(np.linalg.norm(after - before, axis=1))) * finest / shrink
+        if shrink > finest / 4 and shift < _ROUGH_PX:
+            return None
+    found, given = (_score(image, K, each, render_view, shrink=finest) for each in (pose, cam_from_world))
+    better = 1 - found.correlation < _BETTER * (1 - given.correlation) and found.agreeing > _AS_MANY * given.agreeing
+    return found if better else None
+
+
+def _projected(K, pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
+    local = points @ pose[:, :3].T + pose[:, 3]
+    return local[:, :2] / np.maximum(local[:, 2:], 1e-6) * np.diag(K)[:2] + K[:2, 2]
 
 
 def align_photograph(

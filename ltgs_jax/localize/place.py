@@ -12,7 +12,6 @@ from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import CameraModel, Capture, InputError, Photograph, load_image, load_mask
 
 from .affine import Keypoints, affine_keypoints
-from .align import Alignment, RenderView, align_photograph
 from .map import FrozenMap, View, extend_map
 from .pose import PoseEstimate, estimate_pose, find_candidates, grow_pose, with_focal
 from .retrieval import global_descriptor, most_alike
@@ -20,8 +19,6 @@ from .types import Localization, LocalizeConfig, PhotographStatus
 
 Progress = Callable[[str, int, int], None]
 """Called with (what is done, how many are done, of how many)."""
-
-_STARTS = 4  # renders to align a photograph with: the poses of so many photographs that look like it
 
 
 @dataclasses.dataclass
@@ -36,7 +33,6 @@ class _Pending:
     tilted: Keypoints | None
     look: Float[np.ndarray, " d"]
     estimate: PoseEstimate | None = None
-    aligned: Alignment | None = None
 
 
 def localize(
@@ -44,17 +40,13 @@ def localize(
     *,
     config: LocalizeConfig | None = None,
     progress: Progress | None = None,
-    render_view: RenderView | None = None,
 ) -> Localization:
     """Cameras of all photographs of a capture that can be placed (section 3.1 of the paper; gate of hloc's users).
 
     Photographs with a pose keep it and form the frozen map: their keypoints, matched along epipolar lines and
     triangulated. The others are placed by SIFT matches, RANSAC and growth along the prediction (`estimate_pose`); a
     later photograph that was placed joins the map, so that a visit's photographs help each other. `unused` photographs
-    are left alone, `test` ones placed but never part of the map. Returns at once when every pose is given. With
-    `render_view` (of the initial scene, `splat_view`) a later photograph that features cannot place is aligned with
-    renders from the poses of the photographs most like it (`align_photograph`); its inliers are then the patches that
-    agree.
+    are left alone, `test` ones placed but never part of the map. Returns at once when every pose is given.
 
     Raises InputError when no photograph of the first visit has a pose.
     """
@@ -70,13 +62,10 @@ def localize(
         for pending in _place_all(capture, known, unplaced, config, report):
             name = pending.photograph.name
             reason = _gate(pending.estimate, known, config)
-            if reason is not None and render_view is not None and pending.photograph.visit > 0:
-                report("alignment with renders", 0, 1)
-                reason = _align(pending, known, config, render_view) and reason
             status[name] = _found_status(pending, reason)
             if reason is None:
-                lenses[name] = _found_lens(pending)
-                cameras[name] = _found_camera(pending, lenses[name])
+                lenses[name] = found_lens(pending.photograph, pending.K, pending.size)
+                cameras[name] = posed_camera(lenses[name], pending.estimate.cam_from_world)
             elif pending.photograph.camera is None:
                 cameras.pop(name, None)
     statuses = tuple(status[p.name] for p in capture.photographs if p.name in status)
@@ -179,13 +168,17 @@ def _pending(photograph: Photograph, known: list[Photograph], config: LocalizeCo
     """A photograph to be placed, with the best guess of its K."""
     image, plain = _pixels(photograph, config)
     height, width = image.shape[:2]
-    lens = photograph.camera_model
-    K = lens.resized(width, height).K() if lens is not None else _guess_K(known, width, height)
-    return _Pending(photograph, (width, height), K, lens is not None, plain, None, global_descriptor(image))
+    K = working_K(photograph, known, (width, height))
+    lens_known = photograph.camera_model is not None
+    return _Pending(photograph, (width, height), K, lens_known, plain, None, global_descriptor(image))
 
 
-def _guess_K(known: list[Photograph], width: int, height: int) -> Float[np.ndarray, "3 3"]:
-    """K of an unknown lens: the field of view of the known photograph of most similar shape, centred."""
+def working_K(photograph: Photograph, known: list[Photograph], size: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    """K of a photograph without a pose at a working size: of its lens; of one that no file gives, the field of view of
+    the known photograph of most similar shape, centred."""
+    width, height = size
+    if photograph.camera_model is not None:
+        return photograph.camera_model.resized(width, height).K()
     alike = min(known, key=lambda p: abs(np.log(p.width * height / (p.height * width))))
     focal = float(alike.camera.K[0, 0]) * max(width, height) / max(alike.width, alike.height)
     return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -243,21 +236,6 @@ def _polish(placed: list[_Pending], frozen: FrozenMap, config: LocalizeConfig) -
         q.estimate = grown or q.estimate
 
 
-def _align(pending: _Pending, known: list[Photograph], config: LocalizeConfig, render_view: RenderView) -> str | None:
-    """Place a photograph by alignment with renders; None when that is believed, else why not."""
-    looks = np.stack([global_descriptor(load_image(p, max_side=160)) for p in known])
-    nearest = [known[i] for i in most_alike(pending.look, looks, _STARTS)]
-    starts = [np.asarray(p.camera.cam_from_world.as_matrix(), np.float64)[:3] for p in nearest]
-    image = load_image(pending.photograph, max_side=config.max_side)
-    found = align_photograph(image, pending.K, starts, render_view)
-    if found is None or found.agreeing < max(config.min_inliers, 0.5 * found.textured):
-        return "alignment with renders does not agree"
-    if _too_far(-found.cam_from_world[:, :3].T @ found.cam_from_world[:, 3], known, config) is not None:
-        return "alignment with renders leads too far away"
-    pending.aligned = found
-    return None
-
-
 def _gate(estimate: PoseEstimate | None, known: list[Photograph], config: LocalizeConfig) -> str | None:
     """Why a pose is not believed; None when it is."""
     if estimate is None:
@@ -266,10 +244,10 @@ def _gate(estimate: PoseEstimate | None, known: list[Photograph], config: Locali
         return f"only {estimate.inliers} of its keypoints agree with one pose, {config.min_inliers} are needed"
     if estimate.ratio < config.min_ratio:
         return f"only {estimate.ratio:.1%} of its matches agree with one pose, {config.min_ratio:.0%} are needed"
-    return _too_far(estimate.center(), known, config)
+    return too_far(estimate.center(), known, config)
 
 
-def _too_far(center: Float[np.ndarray, "3"], known: list[Photograph], config: LocalizeConfig) -> str | None:
+def too_far(center: Float[np.ndarray, "3"], known: list[Photograph], config: LocalizeConfig) -> str | None:
     """Why a place cannot be: it lies many extents of the known cameras away."""
     centers = np.stack([np.asarray(p.camera.center()) for p in known])
     extent = np.linalg.norm(np.ptp(centers, axis=0))
@@ -288,25 +266,21 @@ def _given_status(capture: Capture, index: int) -> PhotographStatus:
 def _found_status(pending: _Pending, reason: str | None) -> PhotographStatus:
     """What became of a photograph that was looked for."""
     estimate, photograph = pending.estimate, pending.photograph
-    if pending.aligned is not None:
-        return PhotographStatus(photograph.name, "localized", pending.aligned.agreeing, None, None)
     inliers = 0 if estimate is None else estimate.inliers
     residual = None if estimate is None else estimate.residual * photograph.width / pending.size[0]
     return PhotographStatus(photograph.name, "rejected" if reason else "localized", inliers, residual, reason)
 
 
-def _found_lens(pending: _Pending) -> CameraModel:
-    """The lens of a photograph that was placed: what was known of it, with the focal length that was found."""
-    photograph, lens = pending.photograph, pending.photograph.camera_model
-    K = pending.K * np.array([[photograph.width / pending.size[0]], [photograph.height / pending.size[1]], [1.0]])
-    if lens is None:
-        params = (float(K[0, 0]), float(K[0, 2]), float(K[1, 2]))
-        return CameraModel("SIMPLE_PINHOLE", photograph.width, photograph.height, params)
-    return lens
+def found_lens(photograph: Photograph, K: Float[np.ndarray, "3 3"], size: tuple[int, int]) -> CameraModel:
+    """The lens of a photograph that was placed at a working size: the one that is known, else a pinhole of that K."""
+    if photograph.camera_model is not None:
+        return photograph.camera_model
+    width, height = photograph.width, photograph.height
+    fx, _, cx, _, _, cy, *_ = (K * np.array([[width / size[0]], [height / size[1]], [1.0]])).ravel()
+    return CameraModel("SIMPLE_PINHOLE", width, height, (float(fx), float(cx), float(cy)))
 
 
-def _found_camera(pending: _Pending, lens: CameraModel) -> Camera:
-    """The pinhole camera of a photograph that was placed, float32 as those that `io` reads."""
-    found = pending.estimate if pending.aligned is None else pending.aligned
-    pose = SE3.from_matrix(np.concatenate([found.cam_from_world, [[0.0, 0, 0, 1]]]).astype(np.float32))
+def posed_camera(lens: CameraModel, cam_from_world: Float[np.ndarray, "3 4"]) -> Camera:
+    """The pinhole camera of a lens at a pose, float32 as those that `io` reads."""
+    pose = SE3.from_matrix(np.concatenate([cam_from_world, [[0.0, 0, 0, 1]]]).astype(np.float32))
     return lens.camera(SE3(jnp.asarray(pose.quat), jnp.asarray(pose.xyz)))

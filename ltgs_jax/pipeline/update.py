@@ -11,16 +11,12 @@ from typing import Protocol
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
 from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
-from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import (
-    CameraModel,
-    Capture,
     InputError,
     Photograph,
     arrays_of,
@@ -30,12 +26,11 @@ from ltgs_jax.io import (
     read_bytes,
     read_capture,
     read_ply,
-    scaled_size,
     write_json,
 )
-from ltgs_jax.localize import Localization, localize
 from ltgs_jax.scene import Chronology, Splats
 
+from .cameras import Run, hold_against_renders, locate_photographs, scaled_camera
 from .config import Config, check_config
 from .evaluate import evaluate
 from .hold import only_run
@@ -60,21 +55,6 @@ class Progress(Protocol):
     def warn(self, text: str) -> None: ...
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """What every stage needs."""
-
-    capture: Capture
-    cameras: dict[str, Camera]
-    statuses: tuple[dict, ...]
-    config: Config
-    seed: int
-
-    def posed(self, visit: int, role: str) -> list[Photograph]:
-        """Photographs of a visit and role whose camera is known."""
-        return [p for p in self.capture.at(visit, role) if p.name in self.cameras]
-
-
 def update(
     capture_dir: str | Path,
     out_dir: str | Path,
@@ -84,9 +64,11 @@ def update(
     seed: int = 0,
     progress: Progress,
     front_end: FrontEnd | None = None,
+    eye: Eye | None = None,
 ) -> Chronology:
     """Find what changed in a capture and write its chronology to `out_dir` (contract.md); run again, it resumes.
 
+    `front_end` and `eye`, what describes photographs and what renders the scene, may be others than the defaults.
     Raises InputError, one line, for what is wrong with the capture or an option.
     """
     check_config(config, seed)
@@ -108,12 +90,13 @@ def update(
         # leaves the earlier ones as they are.
         files = [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
         key = digest(config.io, config.localize, config.render, seed, files)
-        run = _locate_photographs(store, key, capture, config, seed, progress)
+        run = locate_photographs(store, key, capture, config, seed, progress)
         key = digest(
             key, run.statuses, config.fit.initial, config.detect.gamma, read_bytes(given) if given is not None else None
         )
-        eye = Eye()
+        eye = eye or Eye()
         splats, errors = _initial_scene(store, key, run, scene, front_end, eye, progress)
+        run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
         state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
         key = digest(key, config.detect, config.match, config.template, config.register)
@@ -126,55 +109,6 @@ def update(
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
-
-
-def _locate_photographs(store: Store, key: str, capture: Capture, config: Config, seed: int, progress) -> Run:
-    """Cameras of all photographs, those without a pose placed against the first visit."""
-
-    def compute():
-        found: Localization = localize(
-            capture,
-            config=config.localize,
-            progress=lambda what, done, total: progress.step(done, total, what),
-        )
-        names = sorted(found.cameras)
-        arrays = {
-            "quat": np.stack([np.asarray(found.cameras[n].cam_from_world.quat) for n in names]),
-            "xyz": np.stack([np.asarray(found.cameras[n].cam_from_world.xyz) for n in names]),
-            "K": np.stack([np.asarray(found.cameras[n].K) for n in names]),
-            "size": np.asarray([[found.cameras[n].width, found.cameras[n].height] for n in names]),
-        }
-        statuses = [
-            {"name": p.name, "status": p.status, "inliers": p.inliers, "reason": p.reason} for p in found.photographs
-        ]
-        counts = {kind: sum(s["status"] == kind for s in statuses) for kind in ("given", "localized", "rejected")}
-        lenses = {name: dataclasses.asdict(lens) for name, lens in found.lenses.items()}
-        return arrays, {"names": names, "statuses": statuses, "lenses": lenses, "counts": counts}
-
-    arrays, notes = store.run("localize", key, compute)
-    cameras = {
-        name: Camera(
-            SE3(jnp.asarray(arrays["quat"][i]), jnp.asarray(arrays["xyz"][i])),
-            jnp.asarray(arrays["K"][i]),
-            int(arrays["size"][i, 0]),
-            int(arrays["size"][i, 1]),
-        )
-        for i, name in enumerate(notes["names"])
-    }
-    for status in notes["statuses"]:
-        if status["status"] == "rejected":
-            progress.warn(f"{status['name']}: left out, {status['reason']}")
-    lenses = {name: CameraModel(**{**lens, "params": tuple(lens["params"])}) for name, lens in notes["lenses"].items()}
-    capture = Localization(cameras, lenses, ()).apply(capture)
-    run = Run(capture, cameras, tuple(notes["statuses"]), config, seed)
-    if not run.posed(0, "train"):
-        raise InputError(f"{capture.folder}: no photograph of the first visit has a pose")
-    return run
-
-
-def scaled_camera(camera: Camera, max_side: int | None) -> Camera:
-    """The camera at the size that photographs are worked on."""
-    return camera.resized(*scaled_size(camera.width, camera.height, max_side))
 
 
 def load_view(run: Run, photograph: Photograph) -> View:

@@ -1,0 +1,73 @@
+"""Later photographs held against renders of the initial scene: what features cannot place, and given poses that are
+rough."""
+
+import dataclasses
+
+import numpy as np
+
+from ltgs_jax.io import Capture, Photograph, load_image
+
+from .align import Alignment, RenderView, align_photograph, correct_pose
+from .place import Progress, found_lens, posed_camera, too_far, working_K
+from .retrieval import global_descriptor, most_alike
+from .types import Localization, LocalizeConfig, PhotographStatus
+
+_STARTS = 4  # renders to align a photograph with: the poses of so many photographs that look like it
+
+
+def align_later(
+    capture: Capture,
+    found: Localization,
+    render_view: RenderView,
+    *,
+    max_side: int | None = None,
+    config: LocalizeConfig | None = None,
+    progress: Progress | None = None,
+) -> Localization:
+    """The localisation of a capture after its later photographs were held against renders of the initial scene.
+
+    A photograph that features could not place is aligned from the poses of the photographs most like it
+    (`align_photograph`); one that is to be used and has a given pose is aligned from there, and keeps it unless another
+    is clearly better (`correct_pose`). Both are then `localized`, their inliers the patches that agree. Given poses of
+    `test` photographs are never touched. `capture` is as `localize` took it; `max_side` px of the
+    photographs while they are aligned, at which `render_view` is asked for renders.
+    """
+    config = config or LocalizeConfig()
+    report = progress or (lambda what, done, total: None)
+    cameras, lenses = dict(found.cameras), dict(found.lenses)
+    status = {s.name: s for s in found.photographs}
+    known = [
+        dataclasses.replace(p, camera=cameras[p.name])
+        for p in capture.photographs
+        if p.name in cameras and p.role != "test"
+    ]
+    later = [p for p in capture.photographs if p.visit > 0 and p.name in status]
+    lost = [p for p in later if p.name not in cameras]
+    given = [p for p in later if status[p.name].status == "given" and p.role == "update"]
+    for i, p in enumerate(given + lost):
+        report("holding against renders", i, len(given + lost))
+        image = load_image(p, max_side=max_side)
+        size = image.shape[1], image.shape[0]
+        K = working_K(p, known, size)
+        if p.name in cameras:
+            pose = np.asarray(cameras[p.name].cam_from_world.as_matrix(), np.float64)[:3]
+            aligned = correct_pose(image, K, pose, render_view)
+        else:
+            aligned = _placed(image, K, known, render_view, config)
+        if aligned is not None:
+            lenses[p.name] = found_lens(p, K, size)
+            cameras[p.name] = posed_camera(lenses[p.name], aligned.cam_from_world)
+            status[p.name] = PhotographStatus(p.name, "localized", aligned.agreeing, None, None)
+    return Localization(cameras, lenses, tuple(status[s.name] for s in found.photographs))
+
+
+def _placed(image, K, known: list[Photograph], render_view: RenderView, config: LocalizeConfig) -> Alignment | None:
+    """The pose of a photograph that features could not place; None where none is to be believed."""
+    looks = np.stack([global_descriptor(load_image(p, max_side=160)) for p in known])
+    nearest = [known[i] for i in most_alike(global_descriptor(image), looks, _STARTS)]
+    starts = [np.asarray(p.camera.cam_from_world.as_matrix(), np.float64)[:3] for p in nearest]
+    found = align_photograph(image, K, starts, render_view)
+    if found is None or found.agreeing < max(config.min_inliers, 0.5 * found.textured):
+        return None
+    center = -found.cam_from_world[:, :3].T @ found.cam_from_world[:, 3]
+    return found if too_far(center, known, config) is None else None
