@@ -15,6 +15,7 @@ from ltgs_jax import pipeline
 from ltgs_jax.demo import make_capture
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
+from ltgs_jax.localize import Localization
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
 from ltgs_jax.render import render
@@ -181,7 +182,8 @@ def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
     photographs = sorted((copy / "images" / "IMG_0001").glob("*.png"))
     update_stage = importlib.import_module("ltgs_jax.pipeline.update")
     whole = read_capture(copy)
-    run = update_stage.Run(whole, {p.name: p.camera for p in whole.photographs}, (), CONFIG, 0)
+    found = Localization({p.name: p.camera for p in whole.photographs}, {}, ())
+    run = update_stage.Run(whole, found, CONFIG, 0)
     used = run.posed(1, "update")
     damaged = next(path for path in photographs if used[0].name.endswith(path.name))
     content = bytearray(damaged.read_bytes())

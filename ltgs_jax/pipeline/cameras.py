@@ -4,6 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import CameraModel, Capture, InputError, Photograph, scaled_size
@@ -20,10 +21,19 @@ class Run:
     """What every stage needs."""
 
     capture: Capture
-    cameras: dict[str, Camera]
-    statuses: tuple[dict, ...]
+    found: Localization
     config: Config
     seed: int
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """Of every photograph that has one, by name."""
+        return self.found.cameras
+
+    def poses(self) -> list[str | Float[np.ndarray, "4 4"]]:
+        """Names and poses of all cameras, by which a stage tells others from them."""
+        named = sorted(self.cameras.items())
+        return [part for name, camera in named for part in (name, np.asarray(camera.cam_from_world.as_matrix()))]
 
     def posed(self, visit: int, role: str) -> list[Photograph]:
         """Photographs of a visit and role whose camera is known."""
@@ -45,7 +55,7 @@ def locate_photographs(store: Store, key: str, capture: Capture, config: Config,
     for photograph in found.photographs:
         if photograph.status == "rejected":
             progress.note(f"{photograph.name}: not placed by its features, {photograph.reason}")
-    run = _run_of(capture, found, config, seed)
+    run = Run(found.apply(capture), found, config, seed)
     if not run.posed(0, "train"):
         raise InputError(f"{capture.folder}: no photograph of the first visit has a pose")
     return run
@@ -54,9 +64,6 @@ def locate_photographs(store: Store, key: str, capture: Capture, config: Config,
 def hold_against_renders(store: Store, key: str, run: Run, initial: Splats, eye: Eye, progress) -> Run:
     """The run after the later photographs were held against renders of the initial scene: some that features could not
     place have a camera now, and given poses that were rough are mended."""
-    before = {s["name"]: s["status"] for s in run.statuses}
-    lenses = {p.name: p.camera_model for p in run.capture.photographs if before.get(p.name) == "localized"}
-    found = Localization(run.cameras, lenses, tuple(PhotographStatus(**s) for s in run.statuses))
 
     def view(camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         look = eye.look(initial, camera, np.zeros(initial.count))
@@ -64,18 +71,18 @@ def hold_against_renders(store: Store, key: str, run: Run, initial: Splats, eye:
 
     def compute():
         options = {"max_side": run.config.io.max_side, "config": run.config.localize, "progress": _steps_of(progress)}
-        return _packed(align_later(run.capture, found, view, **options))
+        return _packed(align_later(run.capture, run.found, view, **options))
 
     found = _unpacked(*store.run("align", key, compute))
-    for photograph in found.photographs:
+    for before, photograph in zip(run.found.photographs, found.photographs, strict=True):
         if photograph.status == "rejected":
             progress.warn(f"{photograph.name}: left out, {photograph.reason}")
-        elif photograph.status != before[photograph.name]:
-            was = "its given pose is rough" if before[photograph.name] == "given" else "placed after all"
+        elif photograph.status != before.status:
+            was = "its given pose is rough" if before.status == "given" else "placed after all"
             progress.warn(
                 f"{photograph.name}: {was}, aligned with the first visit ({photograph.inliers} patches agree)"
             )
-    return _run_of(run.capture, found, run.config, run.seed)
+    return Run(found.apply(run.capture), found, run.config, run.seed)
 
 
 def _steps_of(progress):
@@ -107,10 +114,3 @@ def _unpacked(arrays: dict[str, np.ndarray], notes: dict) -> Localization:
     }
     lenses = {name: CameraModel(**{**lens, "params": tuple(lens["params"])}) for name, lens in notes["lenses"].items()}
     return Localization(cameras, lenses, tuple(PhotographStatus(**s) for s in notes["statuses"]))
-
-
-def _run_of(capture: Capture, found: Localization, config: Config, seed: int) -> Run:
-    statuses = tuple(
-        {"name": s.name, "status": s.status, "inliers": s.inliers, "reason": s.reason} for s in found.photographs
-    )
-    return Run(found.apply(capture), found.cameras, statuses, config, seed)

@@ -88,7 +88,11 @@ def write_outputs(
         write_tracks(
             out / "tracks.json",
             visits=list(chronology.visits),
-            photographs=[s for s in run.statuses if not s["name"].startswith(f"{chronology.visits[0]}/")],
+            photographs=[
+                {"name": s.name, "status": s.status, "inliers": s.inliers, "reason": s.reason}
+                for s in run.found.photographs
+                if not s.name.startswith(f"{chronology.visits[0]}/")
+            ],
             objects=objects,
         )
         return {}, {"counts": {"files": len(scenes) + len(objects) + 2 * len(shown), "objects": len(objects)}}

@@ -91,15 +91,14 @@ def update(
         files = [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
         key = digest(config.io, config.localize, config.render, seed, files)
         run = locate_photographs(store, key, capture, config, seed, progress)
-        key = digest(
-            key, run.statuses, config.fit.initial, config.detect.gamma, read_bytes(given) if given is not None else None
-        )
+        brought = read_bytes(given) if given is not None else None
+        key = digest(key, *run.poses(), config.fit.initial, config.detect.gamma, brought)
         eye = eye or Eye()
         splats, errors = _initial_scene(store, key, run, scene, front_end, eye, progress)
         run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
         state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
-        key = digest(key, config.detect, config.match, config.template, config.register)
+        key = digest(key, *run.poses(), config.detect, config.match, config.template, config.register)
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
             free_programs()
