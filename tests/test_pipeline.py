@@ -19,7 +19,7 @@ from ltgs_jax.localize import Localization
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
 from ltgs_jax.render import render
-from ltgs_jax.scene import Splats, Template, compose
+from ltgs_jax.scene import Splats, Template, compose, concatenate_splats
 
 _TINY = pipeline.PRESETS["tiny"]
 CONFIG = replace(_TINY, fit=replace(_TINY.fit, long=replace(_TINY.fit.long, passes=2)))
@@ -242,6 +242,29 @@ def test_known_objects_side_by_side_have_the_shape_of_one_change():
     assert shape(found(right)) == 1
     assert shape(found(left | right)) == 0.5  # it lies upon the first
     assert shape(found(right, gain=0.01)) == 0.5  # it is no evidence itself
+
+
+def test_a_patch_of_what_stands_there_is_no_object_and_a_thing_before_it_is():
+    from ltgs_jax.pipeline.arrivals import _clings
+    from ltgs_jax.pipeline.state import State
+    from ltgs_jax.template import Support
+
+    rng = np.random.default_rng(5)
+
+    def box(count: int, low: list[float], high: list[float]) -> Splats:
+        means = rng.uniform(low, high, (count, 3)).astype(np.float32)
+        quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+        scales = np.full((count, 3), np.log(0.02), np.float32)
+        return Splats(means, quats, scales, np.full(count, 3, np.float32), np.zeros((count, 1, 3), np.float32))
+
+    ground, carton = box(500, [-1, -1, 0], [1, 1, 0]), box(500, [0.3, -0.2, 0], [0.32, 0.2, 0.6])
+    state = State.of_initial(concatenate_splats([ground, carton]), np.zeros(1000, np.float32), ("a", "b"))
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
+    assert _clings(state, 1, box(200, [0.28, -0.1, 0.05], [0.3, 0.1, 0.2]), support)
+    assert not _clings(state, 1, box(200, [0.0, -0.1, 0], [0.2, 0.1, 0.2]), support)
+    assert not _clings(state, 1, box(200, [-0.5, -0.1, 0], [-0.2, 0.1, 0.03]), support)
+    # What stands so close that it touches is a thing all the same.
+    assert not _clings(state, 1, box(200, [0.1, -0.1, 0], [0.3, 0.1, 0.2]), support)
 
 
 def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():

@@ -44,6 +44,7 @@ _COVERED = 0.25  # share of what changed clearly that a template must cover afte
 _BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
 _APART = 0.2  # share of the smaller of two outlines, up to which they may overlap and be of things side by side
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
+_CLINGS = 0.3  # distance, in sizes of a new object, to what stands there, within which it is a patch of that
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -401,6 +402,9 @@ def _add_new(
         pose = state.chronology.world_from_template[t, whole]
         piece = on_host(transform_splats(pose.inverse(), object_splats))
         return extend_template(state, whole, piece, np.full(piece.count, doubt, state.errors.dtype)), None
+    if _clings(state, t, object_splats, arrival.support):
+        progress.note(f"visit {t}: a patch of something that stands there, in {views} photographs, left out")
+        return state, None
     errors = np.full(object_splats.count, doubt, state.errors.dtype)
     template = Template(object_splats, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
@@ -420,6 +424,20 @@ def _shown(state: State, t: int, k: int, observations, *, eye: Eye) -> float:
 
 def _with_ground(state: State, t: int, splats: Splats, doubt: float) -> State:
     return extend_background(state, splats, np.full(splats.count, doubt), np.zeros(splats.count, bool), t)
+
+
+def _clings(state: State, t: int, piece: Splats, support: Support) -> bool:
+    """Whether a piece lies all along what stands beside it: a shadow on that, or a side of it that was badly seen."""
+    size = template_diameter(piece)
+
+    def above(splats: Splats) -> Float[np.ndarray, "n 3"]:
+        means = np.asarray(splats.means, np.float64)
+        return means[(np.asarray(splats.opacities) > 0.3) & (support.height(means) > _LOW * size)]
+
+    body, standing = above(piece), above(scene_at(state, t)[0])
+    if not len(body) or not len(standing):
+        return False
+    return float(np.median(cKDTree(standing).query(body)[0])) < _CLINGS * size
 
 
 def _part_of(state: State, t: int, piece: Splats) -> int | None:
