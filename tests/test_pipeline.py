@@ -244,8 +244,8 @@ def test_known_objects_side_by_side_have_the_shape_of_one_change():
     assert shape(found(right, gain=0.01)) == 0.5  # it is no evidence itself
 
 
-def test_a_patch_of_what_stands_there_is_no_object_and_a_thing_before_it_is():
-    from ltgs_jax.pipeline.arrivals import _clings
+def test_a_thing_stands_on_its_surface_and_neither_floats_nor_clings():
+    from ltgs_jax.pipeline.arrivals import _stands
     from ltgs_jax.pipeline.state import State
     from ltgs_jax.template import Support
 
@@ -260,11 +260,12 @@ def test_a_patch_of_what_stands_there_is_no_object_and_a_thing_before_it_is():
     ground, carton = box(500, [-1, -1, 0], [1, 1, 0]), box(500, [0.3, -0.2, 0], [0.32, 0.2, 0.6])
     state = State.of_initial(concatenate_splats([ground, carton]), np.zeros(1000, np.float32), ("a", "b"))
     support = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
-    assert _clings(state, 1, box(200, [0.28, -0.1, 0.05], [0.3, 0.1, 0.2]), support)
-    assert not _clings(state, 1, box(200, [0.0, -0.1, 0], [0.2, 0.1, 0.2]), support)
-    assert not _clings(state, 1, box(200, [-0.5, -0.1, 0], [-0.2, 0.1, 0.03]), support)
+    assert not _stands(state, 1, box(200, [0.28, -0.1, 0.05], [0.3, 0.1, 0.2]), support)
+    assert _stands(state, 1, box(200, [0.0, -0.1, 0], [0.2, 0.1, 0.2]), support)
+    assert _stands(state, 1, box(200, [-0.5, -0.1, 0], [-0.2, 0.1, 0.03]), support)
+    assert not _stands(state, 1, box(200, [-0.5, -0.1, 0.1], [-0.3, 0.1, 0.3]), support)
     # What stands so close that it touches is a thing all the same.
-    assert not _clings(state, 1, box(200, [0.1, -0.1, 0], [0.3, 0.1, 0.2]), support)
+    assert _stands(state, 1, box(200, [0.1, -0.1, 0], [0.3, 0.1, 0.2]), support)
 
 
 def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():

@@ -45,6 +45,7 @@ _BEHIND = 0.2  # share of the change by which another may explain less than one 
 _APART = 0.2  # share of the smaller of two outlines, up to which they may overlap and be of things side by side
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _CLINGS = 0.3  # distance, in sizes of a new object, to what stands there, within which it is a patch of that
+_FLOATS = 0.25  # height of the lowest of a new object, in its sizes, from which on nothing carries it
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -402,8 +403,8 @@ def _add_new(
         pose = state.chronology.world_from_template[t, whole]
         piece = on_host(transform_splats(pose.inverse(), object_splats))
         return extend_template(state, whole, piece, np.full(piece.count, doubt, state.errors.dtype)), None
-    if _clings(state, t, object_splats, arrival.support):
-        progress.note(f"visit {t}: a patch of something that stands there, in {views} photographs, left out")
+    if not _stands(state, t, object_splats, arrival.support):
+        progress.note(f"visit {t}: a change in {views} photographs that floats, or clings to what is there, left out")
         return state, None
     errors = np.full(object_splats.count, doubt, state.errors.dtype)
     template = Template(object_splats, next_identity(state), t)
@@ -426,9 +427,12 @@ def _with_ground(state: State, t: int, splats: Splats, doubt: float) -> State:
     return extend_background(state, splats, np.full(splats.count, doubt), np.zeros(splats.count, bool), t)
 
 
-def _clings(state: State, t: int, piece: Splats, support: Support) -> bool:
-    """Whether a piece lies all along what stands beside it: a shadow on that, or a side of it that was badly seen."""
+def _stands(state: State, t: int, piece: Splats, support: Support) -> bool:
+    """Whether a piece is a thing on its surface: it neither floats, nor lies all along what stands there, as the shade
+    on that does, or a side of it that was badly seen."""
     size = template_diameter(piece)
+    if np.quantile(support.height(np.asarray(piece.means, np.float64)), 0.05) > _FLOATS * size:
+        return False
 
     def above(splats: Splats) -> Float[np.ndarray, "n 3"]:
         means = np.asarray(splats.means, np.float64)
@@ -436,8 +440,8 @@ def _clings(state: State, t: int, piece: Splats, support: Support) -> bool:
 
     body, standing = above(piece), above(scene_at(state, t)[0])
     if not len(body) or not len(standing):
-        return False
-    return float(np.median(cKDTree(standing).query(body)[0])) < _CLINGS * size
+        return True
+    return float(np.median(cKDTree(standing).query(body)[0])) > _CLINGS * size
 
 
 def _part_of(state: State, t: int, piece: Splats) -> int | None:
