@@ -27,9 +27,9 @@ def align_later(
     """The localisation of a capture after its later photographs were held against renders of the initial scene.
 
     A photograph that features could not place is aligned from the poses of the photographs most like it
-    (`align_photograph`); one that is to be used and has a given pose is aligned from there, and keeps it unless another
-    is clearly better (`correct_pose`). Both are then `localized`, their inliers the patches that agree. Given poses of
-    `test` photographs are never touched. `capture` is as `localize` took it; `max_side` px of the
+    (`align_photograph`); one that is to be used is aligned from the pose that it has, and keeps that unless another is
+    clearly better (`correct_pose`). Both are then `localized`, their inliers the patches that agree. Poses of `test`
+    photographs are never touched. `capture` is as `localize` took it; `max_side` px of the
     photographs while they are aligned, at which `render_view` is asked for renders.
     """
     config = config or LocalizeConfig()
@@ -43,9 +43,9 @@ def align_later(
     ]
     later = [p for p in capture.photographs if p.visit > 0 and p.name in status]
     lost = [p for p in later if p.name not in cameras]
-    given = [p for p in later if status[p.name].status == "given" and p.role == "update"]
-    for i, p in enumerate(given + lost):
-        report("holding against renders", i, len(given + lost))
+    posed = [p for p in later if p.name in cameras and p.role == "update"]
+    for i, p in enumerate(posed + lost):
+        report("holding against renders", i, len(posed + lost))
         image = load_image(p, max_side=max_side)
         size = image.shape[1], image.shape[0]
         K = working_K(p, known, size)

@@ -74,15 +74,19 @@ def hold_against_renders(store: Store, key: str, run: Run, initial: Splats, eye:
         return _packed(align_later(run.capture, run.found, view, **options))
 
     found = _unpacked(*store.run("align", key, compute))
-    for before, photograph in zip(run.found.photographs, found.photographs, strict=True):
+    for photograph in found.photographs:
+        name, agree = photograph.name, f"{photograph.inliers} patches agree"
         if photograph.status == "rejected":
-            progress.warn(f"{photograph.name}: left out, {photograph.reason}")
-        elif photograph.status != before.status:
-            was = "its given pose is rough" if before.status == "given" else "placed after all"
-            progress.warn(
-                f"{photograph.name}: {was}, aligned with the first visit ({photograph.inliers} patches agree)"
-            )
+            progress.warn(f"{name}: left out, {photograph.reason}")
+        elif name not in run.cameras:
+            progress.warn(f"{name}: placed by renders of the first visit after all, {agree}")
+        elif name in found.cameras and not _same_pose(run.cameras[name], found.cameras[name]):
+            progress.warn(f"{name}: its pose was rough, mended on renders of the first visit, {agree}")
     return Run(found.apply(run.capture), found, run.config, run.seed)
+
+
+def _same_pose(a: Camera, b: Camera) -> bool:
+    return np.array_equal(a.cam_from_world.as_matrix(), b.cam_from_world.as_matrix())
 
 
 def _steps_of(progress):
