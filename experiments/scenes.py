@@ -46,7 +46,6 @@ from ltgs_jax.scene import Splats
 
 _MARGIN = 5  # pixels by which the changed region is dilated, as `ltgs eval` does
 _FREE = -15.0  # logit of opacity under which a splat is an empty slot
-_FRAMES = 5  # renders whose median is the frame rate
 
 
 @dataclass(frozen=True)
@@ -191,10 +190,13 @@ def score(problem: Problem, answer: Answer, folder: Path) -> dict[str, float]:
     Leaves one render per visit in folder/renders. `@0` tells what is forgotten of the first visit.
     """
     pooled: dict[str, list[float]] = {}
+    times: list[float] = []
     shutil.rmtree(folder / "renders", ignore_errors=True)
     for t in range(len(problem.visits)):
         for i, held in enumerate(problem.test[t]):
+            start = time.perf_counter()
             image = answer.render(t, held.view.camera)
+            times.append(time.perf_counter() - start)
             target = held.view.image.astype(np.float32) / 255
             if i == 0:
                 write_image(folder / "renders" / Path(held.name).with_suffix(".png"), image)
@@ -216,18 +218,4 @@ def score(problem: Problem, answer: Answer, folder: Path) -> dict[str, float]:
                     if t > 0:
                         pooled.setdefault(f"{key}_{region}", []).append(value)
     row = {key: statistics.fmean(values) for key, values in pooled.items()}
-    return {**row, **answer.said, "bytes": answer.bytes, "fps": _frames_per_second(problem, answer)}
-
-
-def _frames_per_second(problem: Problem, answer: Answer) -> float:
-    last = len(problem.visits) - 1
-    held = problem.test[last] or problem.test[0]
-    if not held:
-        return math.nan
-    answer.render(last, held[0].view.camera)
-    times = []
-    for _ in range(_FRAMES):
-        start = time.perf_counter()
-        answer.render(last, held[0].view.camera)
-        times.append(time.perf_counter() - start)
-    return 1 / statistics.median(times)
+    return {**row, **answer.said, "bytes": answer.bytes, "fps": 1 / statistics.median(times) if times else math.nan}
