@@ -18,7 +18,7 @@ from rich.console import Console
 from ltgs_jax.cli import main
 from ltgs_jax.cli.arguments import Export, Update, UsageError, parse
 from ltgs_jax.cli.commands import score_table, visit_number
-from ltgs_jax.cli.main import keep_compiled_code
+from ltgs_jax.cli.main import INTERRUPTED, WRONG_INPUT, entry, keep_compiled_code
 from ltgs_jax.cli.progress import BarReporter, LineReporter, make_reporter
 from ltgs_jax.io import InputError, write_json
 
@@ -416,3 +416,19 @@ def test_the_documents_name_commands_and_options_that_exist(pipeline, capsys):
         known = capsys.readouterr().out
         for option in re.findall(r"--[a-z][a-z-]*", line):
             assert option in known, line
+
+
+def test_an_interrupted_process_does_not_wait_for_its_threads(monkeypatch):
+    ended = []
+
+    def end(status: int) -> None:
+        ended.append(status)
+        raise SystemExit(status)
+
+    monkeypatch.setattr(os, "_exit", end)
+    for status, ends in ((INTERRUPTED, [INTERRUPTED]), (WRONG_INPUT, [])):
+        monkeypatch.setattr(sys.modules["ltgs_jax.cli.main"], "main", lambda status=status: status)
+        ended.clear()
+        with pytest.raises(SystemExit) as stopped:
+            entry()
+        assert (stopped.value.code, ended) == (status, ends)

@@ -12,6 +12,16 @@ from .arguments import UsageError, parse
 DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 
+def entry() -> None:
+    """The process `ltgs`. Interrupted, it ends at once: threads that still compile would crash with the interpreter."""
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    if status == INTERRUPTED:
+        os._exit(status)
+    sys.exit(status)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command that `argv` (the process's own arguments unless given) names; returns the exit status.
 
