@@ -222,6 +222,19 @@ def test_a_rough_given_pose_is_held_against_renders_and_the_others_stay(tmp_path
     assert all(after.cameras[name] is before.cameras[name] for name in status if name != "b/1.png")
 
 
+def test_a_photograph_that_cannot_be_decoded_keeps_its_pose(tmp_path, scene):
+    folder = _write(tmp_path, scene, given=set(scene))
+    capture = read_capture(folder)
+    before = localize(capture)
+    damaged = folder / "images" / "b" / "1.png"
+    content = bytearray(damaged.read_bytes())
+    content[len(content) // 2 :] = bytes(len(content) - len(content) // 2)
+    damaged.write_bytes(content)
+    after = align_later(capture, before, _view_of())
+    assert after.cameras == before.cameras
+    assert {s.status for s in after.photographs} == {"given"}
+
+
 def test_what_features_cannot_place_is_aligned_with_renders(tmp_path):
     textures = tuple(cv2.GaussianBlur(_texture(seed), (0, 0), 6) for seed in (1, 2))
     textures = tuple(cv2.normalize(texture, None, 40, 220, cv2.NORM_MINMAX) for texture in textures)

@@ -5,7 +5,7 @@ import dataclasses
 
 import numpy as np
 
-from ltgs_jax.io import Capture, Photograph, load_image
+from ltgs_jax.io import Capture, InputError, Photograph, load_image
 
 from .align import Alignment, RenderView, align_photograph, correct_pose
 from .place import Progress, found_lens, posed_camera, too_far, working_K
@@ -29,8 +29,8 @@ def align_later(
     A photograph that features could not place is aligned from the poses of the photographs most like it
     (`align_photograph`); one that is to be used is aligned from the pose that it has, and keeps that unless another is
     clearly better (`correct_pose`). Both are then `localized`, their inliers the patches that agree. Poses of `test`
-    photographs are never touched. `capture` is as `localize` took it; `max_side` px of the
-    photographs while they are aligned, at which `render_view` is asked for renders.
+    photographs are never touched, nor is what cannot be decoded. `capture` is as `localize` took it; `max_side` px of
+    the photographs while they are aligned, at which `render_view` is asked for renders.
     """
     config = config or LocalizeConfig()
     report = progress or (lambda what, done, total: None)
@@ -46,7 +46,10 @@ def align_later(
     posed = [p for p in later if p.name in cameras and p.role == "update"]
     for i, p in enumerate(posed + lost):
         report("holding against renders", i, len(posed + lost))
-        image = load_image(p, max_side=max_side)
+        try:
+            image = load_image(p, max_side=max_side)
+        except InputError:
+            continue  # who uses it names it
         size = image.shape[1], image.shape[0]
         K = working_K(p, known, size)
         if p.name in cameras:
