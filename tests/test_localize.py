@@ -1,11 +1,15 @@
 """Localisation on a made-up corner of two textured planes, whose true cameras are known in closed form."""
 
+import dataclasses
+
 import cv2
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ltgs_jax.io import InputError, read_capture
+from ltgs_jax.io.capture import Observations
 from ltgs_jax.localize import LocalizeConfig, align_later, localize
 from ltgs_jax.localize.tracks import join_tracks, triangulate
 
@@ -220,6 +224,22 @@ def test_a_rough_given_pose_is_held_against_renders_and_the_others_stay(tmp_path
     degrees, distance = _error(after.cameras["b/1.png"], pose)
     assert degrees < 0.1 and distance < 0.01
     assert all(after.cameras[name] is before.cameras[name] for name in status if name != "b/1.png")
+
+
+def test_sparse_points_vouch_for_a_given_pose(tmp_path, scene):
+    rough = dict(scene)
+    pixels, pose, focal = scene["b/1.png"]
+    rough["b/1.png"] = (pixels, cv2.Rodrigues(np.array([0.015, -0.015, 0.01]))[0] @ pose, focal)
+    capture = read_capture(_write(tmp_path, rough, given=set(rough)))
+    index = [p.name for p in capture.photographs].index("b/1.png")
+    points = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 0], (40, 3))
+    xy = np.asarray(capture.photographs[index].camera.project(jnp.asarray(points, jnp.float32))[0])
+    for shift, kept in ((0.5, True), (5.0, False)):
+        seen = Observations(np.full(40, index), np.arange(40), xy + shift)
+        told = dataclasses.replace(capture, points=points, point_observations=seen)
+        before = localize(told)
+        after = align_later(told, before, _view_of())
+        assert (after.cameras["b/1.png"] is before.cameras["b/1.png"]) == kept
 
 
 def test_a_photograph_that_cannot_be_decoded_keeps_its_pose(tmp_path, scene):

@@ -21,7 +21,7 @@ _FINEST_PX = 320  # longer side of the finest level
 _PATCH_PX = 16
 _ROUGH_PX = 0.5  # at the finest level, up to which a pose is as good as alignment makes it
 _BETTER = 0.9  # of what a pose leaves uncorrelated, below which another one is better
-_AS_MANY = 0.9  # of the patches that agreed, which must agree still
+_AGREE = 0.67  # share of the textured patches that agree where a scene shows well enough to correct a pose by
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,7 +174,7 @@ def correct_pose(
     render_view: RenderView,
 ) -> Alignment | None:
     """A better pose than the one that came with a photograph; None where the two show the same within half a pixel (at
-    320 px), or a render at the new one looks no more like the photograph.
+    320 px), or a render at the new one does not look clearly more like the photograph, and like it all over.
 
     Args as of `align_photograph`. Not differentiable.
     """
@@ -191,8 +191,8 @@ def correct_pose(
         if shrink > finest / 4 and shift < _ROUGH_PX:
             return None
     found, given = (_score(image, K, each, render_view, shrink=finest) for each in (pose, cam_from_world))
-    better = 1 - found.correlation < _BETTER * (1 - given.correlation) and found.agreeing > _AS_MANY * given.agreeing
-    return found if better else None
+    better = 1 - found.correlation < _BETTER * (1 - given.correlation)
+    return found if better and found.agreeing > _AGREE * found.textured else None
 
 
 def _projected(K, pose, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:

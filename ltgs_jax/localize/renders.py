@@ -3,6 +3,7 @@ rough."""
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 from ltgs_jax.io import Capture, InputError, Photograph, load_image
@@ -12,6 +13,7 @@ from .place import Progress, found_lens, posed_camera, too_far, working_K
 from .retrieval import global_descriptor, most_alike
 from .types import Localization, LocalizeConfig, PhotographStatus
 
+_VOUCHED_PX = 2.0  # median distance of sparse points up to which they vouch for a pose
 _STARTS = 4  # renders to align a photograph with: the poses of so many photographs that look like it
 
 
@@ -27,10 +29,12 @@ def align_later(
     """The localisation of a capture after its later photographs were held against renders of the initial scene.
 
     A photograph that features could not place is aligned from the poses of the photographs most like it
-    (`align_photograph`); one that is to be used is aligned from the pose that it has, and keeps that unless another is
-    clearly better (`correct_pose`). Both are then `localized`, their inliers the patches that agree. Poses of `test`
-    photographs are never touched, nor is what cannot be decoded. `capture` is as `localize` took it; `max_side` px of
-    the photographs while they are aligned, at which `render_view` is asked for renders.
+    (`align_photograph`). One that is to be used, and has a given pose for which no sparse points vouch, is aligned from
+    there, and keeps it unless another is clearly better (`correct_pose`). Both are then `localized`, their inliers the
+    patches that agree. Poses of `test` photographs are never touched, nor is what cannot be decoded.
+
+    `capture` is as `localize` took it; `max_side` px of the photographs while they are aligned, at which `render_view`
+    is asked for renders.
     """
     config = config or LocalizeConfig()
     report = progress or (lambda what, done, total: None)
@@ -41,11 +45,12 @@ def align_later(
         for p in capture.photographs
         if p.name in cameras and p.role != "test"
     ]
-    later = [p for p in capture.photographs if p.visit > 0 and p.name in status]
-    lost = [p for p in later if p.name not in cameras]
-    posed = [p for p in later if p.name in cameras and p.role == "update"]
-    for i, p in enumerate(posed + lost):
-        report("holding against renders", i, len(posed + lost))
+    later = [(i, p) for i, p in enumerate(capture.photographs) if p.visit > 0 and p.name in status]
+    lost = [p for _, p in later if p.name not in cameras]
+    given = [(i, p) for i, p in later if status[p.name].status == "given" and p.role == "update"]
+    given = [p for i, p in given if not _vouched_for(capture, i, config)]
+    for i, p in enumerate(given + lost):
+        report("holding against renders", i, len(given + lost))
         try:
             image = load_image(p, max_side=max_side)
         except InputError:
@@ -62,6 +67,17 @@ def align_later(
             cameras[p.name] = posed_camera(lenses[p.name], aligned.cam_from_world)
             status[p.name] = PhotographStatus(p.name, "localized", aligned.agreeing, None, None)
     return Localization(cameras, lenses, tuple(status[s.name] for s in found.photographs))
+
+
+def _vouched_for(capture: Capture, index: int, config: LocalizeConfig) -> bool:
+    """Whether the sparse points that a photograph sees, by the capture's own model, lie where its pose has them."""
+    seen = capture.point_observations
+    mine = seen.photographs == index
+    if mine.sum() < config.min_inliers:
+        return False
+    points = jnp.asarray(capture.points[seen.points[mine]], jnp.float32)
+    xy = capture.photographs[index].camera.project(points)[0]
+    return float(np.median(np.linalg.norm(np.asarray(xy) - seen.pixels[mine], axis=1))) < _VOUCHED_PX
 
 
 def _placed(image, K, known: list[Photograph], render_view: RenderView, config: LocalizeConfig) -> Alignment | None:
