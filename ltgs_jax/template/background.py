@@ -109,8 +109,7 @@ def fill_under(
     ring = local[on_plane, :2]
     colors = np.clip(np.asarray(background.sh)[on_plane, 0] * C0 + 0.5, 0, 1)
     tree = cKDTree(ring)
-    # Twice the distance to the nearest neighbour: a grid as dense as the ground around.
-    spacing = float(np.clip(2 * np.median(tree.query(ring, k=2)[0][:, 1]), size / 60, size / 12))
+    spacing = float(np.clip(np.median(tree.query(ring, k=2)[0][:, 1]), size / 60, size / 12))
     margin = 2 * spacing
     axes = [np.arange(a - margin, b + margin, spacing) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
