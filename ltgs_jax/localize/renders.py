@@ -2,6 +2,7 @@
 rough."""
 
 import dataclasses
+from functools import cache
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,6 +50,7 @@ def align_later(
     lost = [p for _, p in later if p.name not in cameras]
     given = [(i, p) for i, p in later if status[p.name].status == "given" and p.role == "update"]
     given = [p for i, p in given if not _vouched_for(capture, i, config)]
+    looks = cache(lambda: np.stack([global_descriptor(load_image(p, max_side=160)) for p in known]))
     for i, p in enumerate(given + lost):
         report("holding against renders", i, len(given + lost))
         try:
@@ -61,7 +63,7 @@ def align_later(
             pose = np.asarray(cameras[p.name].cam_from_world.as_matrix(), np.float64)[:3]
             aligned = correct_pose(image, K, pose, render_view)
         else:
-            aligned = _placed(image, K, known, render_view, config)
+            aligned = _placed(image, K, known, looks(), render_view, config)
         if aligned is not None:
             lenses[p.name] = found_lens(p, K, size)
             cameras[p.name] = posed_camera(lenses[p.name], aligned.cam_from_world)
@@ -80,9 +82,10 @@ def _vouched_for(capture: Capture, index: int, config: LocalizeConfig) -> bool:
     return float(np.median(np.linalg.norm(np.asarray(xy) - seen.pixels[mine], axis=1))) < _VOUCHED_PX
 
 
-def _placed(image, K, known: list[Photograph], render_view: RenderView, config: LocalizeConfig) -> Alignment | None:
+def _placed(
+    image, K, known: list[Photograph], looks, render_view: RenderView, config: LocalizeConfig
+) -> Alignment | None:
     """The pose of a photograph that features could not place; None where none is to be believed."""
-    looks = np.stack([global_descriptor(load_image(p, max_side=160)) for p in known])
     nearest = [known[i] for i in most_alike(global_descriptor(image), looks, _STARTS)]
     starts = [np.asarray(p.camera.cam_from_world.as_matrix(), np.float64)[:3] for p in nearest]
     found = align_photograph(image, K, starts, render_view)
