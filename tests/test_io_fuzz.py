@@ -127,7 +127,9 @@ def _run(folder: Path) -> None:
     io.write_json(folder / "cameras.json", {"capture": "/nowhere", "photographs": {"b/0.png": camera}})
     io.write_json(folder / "report.json", {"photographs": [shown]})
     io.write_json(folder / "metrics.json", [row])
-    io.write_json(folder / "stages.json", [{**stage, "counts": {"masks": 4}}])
+    bought = {"visit": "b", "what": "object 1 moved", "parameters": 7, "bytes": 28, "gain_db": 3.25}
+    ledger = {**stage, "stage": "ledger", "counts": {"ledger": [bought]}}
+    io.write_json(folder / "stages.json", [{**stage, "counts": {"masks": 4}}, ledger])
 
 
 def _look_at(folder: Path) -> None:

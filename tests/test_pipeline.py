@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -106,6 +107,20 @@ def test_scores_cover_later_visits_and_the_truth(run):
     keys = {row["key"] for row in rows}
     assert {"psnr", "ssim", "flip", "event_f1", "mask_iou", "mask_f1"} <= keys
     assert all(np.isfinite(row["value"]) for row in rows)
+
+
+def test_the_ledger_says_what_each_thing_cost_and_bought(run):
+    chronology = load_chronology(run)
+    rows = next(row for row in read_json(run / "stages.json", list) if row["stage"] == "ledger")["counts"]["ledger"]
+    moved = [row for row in rows if row["what"].endswith(("moved", "added"))]
+    assert moved and all(row["gain_db"] > 0.1 for row in moved)
+    assert all(row["bytes"] == 4 * row["parameters"] for row in rows)
+    per_splat = sum(np.prod(leaf.shape[1:], dtype=int) for leaf in jax.tree.leaves(chronology.background))
+    late = int((np.asarray(chronology.since) > 0).sum())
+    assert sum(row["parameters"] for row in rows if row["what"] == "ground") == late * per_splat
+    for row in rows:
+        if row["what"].endswith("moved"):
+            assert row["parameters"] == 7  # a pose and nothing else
 
 
 def test_a_second_run_resumes_and_changes_nothing(run, capture):

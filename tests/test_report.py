@@ -97,6 +97,8 @@ def chronology(tmp_path):
          "counts": {"masks": 4}, "resumed": False}
         for name, seconds in (("detect", 12.5), ("fit", 61.0))
     ]  # fmt: skip
+    bought = {"visit": VISITS[1], "what": "object 1 moved", "parameters": 7, "bytes": 28, "gain_db": 3.25}
+    stages.append({"stage": "ledger", "status": "done", "counts": {"ledger": [bought]}})
     for name, value in {
         "tracks": tracks, "metrics": rows, "stages": stages, "report": {"photographs": photographs},
         "config": {"fit": {"steps": 5}},
@@ -163,6 +165,14 @@ def test_the_page_says_what_happened(chronology):
     assert "later/9.png: 7 inliers, fewer than <20>" in text
     assert "1 moved, 1 went" in text or "1 came, 1 went, 1 moved" in text
     assert "20.000" in text and "–" in text and "768 MiB" in text and "61.0" in text
+
+
+def test_the_page_says_what_each_visit_added_and_bought(chronology):
+    text, _ = _read(write_report(chronology).read_text())
+    assert "object 1 moved" in text and "3.250" in text and "dB bought" in text
+    (chronology / "stages.json").write_text(json.dumps([{"stage": "ledger", "counts": {"ledger": 7}}]))
+    text, _ = _read(write_report(chronology).read_text())
+    assert "dB bought" not in text  # what cannot be read as rows is left out
 
 
 def test_a_poor_first_scene_is_said_where_it_matters(chronology):

@@ -60,12 +60,17 @@ class Account(eqx.Module):
 _compose = eqx.filter_jit(compose)  # eagerly, every template's new shape would compile every operation anew
 
 
+def composed(chronology: Chronology, t: int) -> Splats:
+    """`compose` by one program, on the host."""
+    return on_host(_compose(chronology, jnp.asarray(t)))
+
+
 def scene_at(
     state: State, t: int
 ) -> tuple[Splats, Float[np.ndarray, " n"], Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """The scene at visit t with hidden templates left out: splats, expected errors, owner (0 background, 1 + k), and
     whether guessed."""
-    splats = on_host(_compose(state.chronology, jnp.asarray(t)))
+    splats = composed(state.chronology, t)
     errors = np.concatenate([state.errors, *state.template_errors])
     counts = [state.chronology.background.count, *[m.splats.count for m in state.chronology.templates]]
     owner = np.repeat(np.arange(len(counts)), counts)

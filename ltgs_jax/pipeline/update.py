@@ -28,17 +28,18 @@ from ltgs_jax.io import (
     read_ply,
     write_json,
 )
-from ltgs_jax.scene import Chronology, Splats
+from ltgs_jax.scene import Chronology, Splats, drop_hidden
 
 from .cameras import Run, hold_against_renders, locate_photographs, scaled_camera
 from .config import Config, check_config
 from .evaluate import evaluate
 from .hold import only_run
+from .ledger import make_ledger
 from .looks import Eye, Observation, expected_errors
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
-from .state import Account, State, pack_state, scene_at, unpack_state
+from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
 
@@ -104,7 +105,9 @@ def update(
             free_programs()
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
-        chronology = _long_fit(store, digest(key, "fit"), run, state, eye, progress)
+        key = digest(key, "fit", config.fit.long)
+        chronology = _long_fit(store, key, run, state, eye, progress)
+        _ledger(store, digest(key, "ledger"), run, chronology, accounts, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
@@ -222,18 +225,12 @@ def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress
     config = run.config
 
     def compute():
-        visits = range(1, len(run.capture.visits))
-        later = [(p, view, t) for t in visits for p, view in load_views(run, run.posed(t, "update"), progress)]
-        if not state.chronology.templates or not later:
+        if not state.chronology.templates:
             progress.note("nothing changed: the chronology is the initial scene")
             arrays, notes = pack_state(state)
             return arrays, {**notes, "counts": {"steps": 0}}
         views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-        for _, view, t in later:
-            rendered = eye.image(scene_at(state, t)[0], view.camera)
-            tone = fit_tone(view.image.astype(np.float32) / 255, rendered, view.mask)
-            image = np.rint(255 * tone(view.image.astype(np.float32) / 255)).astype(np.uint8)
-            views.append(VisitView(View(view.camera, image, view.mask), t))
+        views += _later_views(run, state.chronology, eye, progress)
         chronology, losses = fit_chronology(
             state.chronology,
             views,
@@ -245,8 +242,31 @@ def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress
         arrays, notes = pack_state(fitted)
         return arrays, {**notes, "counts": {"steps": len(losses)}}
 
-    arrays, notes = store.run("fit", digest(key, config.fit.long), compute)
+    arrays, notes = store.run("fit", key, compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology
+
+
+def _later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[VisitView]:
+    """The photographs of later visits that may be used, in the light of the first."""
+    views = []
+    for t in range(1, len(run.capture.visits)):
+        loaded = load_views(run, run.posed(t, "update"), progress)
+        scene = drop_hidden(composed(chronology, t)) if loaded else None
+        for _, view in loaded:
+            image = view.image.astype(np.float32) / 255
+            tone = fit_tone(image, eye.image(scene, view.camera), view.mask)
+            views.append(VisitView(View(view.camera, np.rint(255 * tone(image)).astype(np.uint8), view.mask), t))
+    return views
+
+
+def _ledger(store: Store, key: str, run: Run, chronology: Chronology, accounts, eye: Eye, progress) -> None:
+    """What each visit added and what that bought, in stages.json."""
+
+    def compute():
+        views = _later_views(run, chronology, eye, progress) if chronology.templates else []
+        return {}, {"counts": {"ledger": make_ledger(chronology, accounts, views, eye, progress=progress.step)}}
+
+    store.run("ledger", key, compute)
 
 
 def _environment() -> dict:

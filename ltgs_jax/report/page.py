@@ -54,6 +54,7 @@ def page(run: Run, gallery: Gallery, sides: dict[int, list[str]]) -> str:
         ("objects", "Objects", _objects(run, gallery, sides)),
         ("photographs", "Photographs", _photographs(run, gallery)),
         ("scores", "Scores", _scores(run.metrics)),
+        ("ledger", "What each visit added", _ledger(run.stages)),
         ("stages", "Time and memory", _stages(run.stages)),
         ("cameras", "Cameras", _cameras(run.placements)),
         ("options", "Options and versions", _options(run)),
@@ -181,6 +182,31 @@ def _scores(rows: Sequence[dict]) -> str:
     return _table(heads, body)
 
 
+def _ledger(stages: Sequence[dict]) -> str:
+    """What each visit added, in numbers and bytes, and what that bought."""
+    counts = next((row.get("counts") for row in stages if row.get("stage") == "ledger"), None)
+    listed = counts.get("ledger") if isinstance(counts, dict) else None
+    rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
+    if not rows:
+        return ""
+    heads = ["visit", "what", "numbers added", "KiB", "dB bought"]
+    body = [
+        [
+            str(row.get("visit", "")),
+            str(row.get("what", "")),
+            row.get("parameters"),
+            None if (size := _number(row.get("bytes"))) is None else _Cell(f"{size / 1024:.1f}", size),
+            _number(row.get("gain_db")),
+        ]
+        for row in rows
+    ]
+    words = (
+        "dB: PSNR over the photographs of the visit, whole, less that without this one thing (an object as it was at "
+        "the visit before). They are the photographs that it was fitted to."
+    )
+    return f'<p class="soft">{words}</p>{_table(heads, body)}'
+
+
 def _number(value: Any) -> float | None:
     try:
         return float(value) if isinstance(value, int | float) else None
@@ -197,7 +223,8 @@ def _stages(rows: Sequence[dict]) -> str:
         seconds = _number(row.get("seconds")) or 0
         bar = f'<span class="meter" style="width:{100 * seconds / longest:.1f}%"></span>'
         counts = row.get("counts")
-        listed = ", ".join(f"{key} {value}" for key, value in counts.items()) if isinstance(counts, dict) else ""
+        plain = counts.items() if isinstance(counts, dict) else ()
+        listed = ", ".join(f"{key} {value}" for key, value in plain if not isinstance(value, list))
         peak = _number(row.get("peak_bytes"))
         body.append(
             [

@@ -1,0 +1,111 @@
+"""What each visit added to the chronology, and what each addition bought: model only what a scene needs (design.md)."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ltgs_jax.fit import VisitView
+from ltgs_jax.scene import Chronology, Splats, drop_hidden
+
+from .looks import Eye
+from .state import Account, composed
+
+_POSE, _SHADE, _BLOB = 7, 4, 5  # numbers for a pose, an object's shade at it, and a shadow's blob
+
+
+def make_ledger(
+    chronology: Chronology,
+    accounts: Sequence[Sequence[Account]],
+    views: Sequence[VisitView],
+    eye: Eye,
+    *,
+    progress: Callable[[int, int, str], None] = lambda i, n, text: None,
+) -> list[dict]:
+    """A row for each account, and for the ground and the light of each visit: {"visit", "what", "parameters", "bytes",
+    "gain_db"}.
+
+    Parameters are those that came with that visit, 4 bytes each. The gain is the PSNR over all of the visit's
+    photographs, whole, less that of the same scene without the one thing: an object where and as it was at the visit
+    before, ground or light left out. They are the photographs that the fit saw: a gain of nothing says that the
+    addition was not worth its bytes, a high one not that it is right.
+    """
+    rows = []
+    names = chronology.visits
+    for t in range(1, len(names)):
+        seen = [v for v in views if v.visit == t]
+        progress(t, len(names), f"what {names[t]} added and bought")
+        without = _without(chronology, accounts[t] if t < len(accounts) else (), t)
+        if not seen or not without:
+            continue
+        whole = _error(chronology, t, seen, eye)
+        for what, numbers, other in without:
+            gain = 10 * np.log10(max(_error(other, t, seen, eye), 1e-12) / max(whole, 1e-12))
+            rows.append(
+                {
+                    "visit": names[t],
+                    "what": what,
+                    "parameters": numbers,
+                    "bytes": 4 * numbers,
+                    "gain_db": round(float(gain), 3),
+                }
+            )
+    return rows
+
+
+def _without(chronology: Chronology, accounts: Sequence[Account], t: int) -> list[tuple[str, int, Chronology]]:
+    """What visit t added: in words, how many numbers it takes, and the chronology without it."""
+    found = []
+    poses, visible = jax.tree.map(np.array, (chronology.world_from_template, chronology.visible))
+    for k in sorted({a.template for a in accounts}):
+        kind = next(a.kind for a in accounts if a.template == k)
+        template = chronology.templates[k]
+        numbers = _POSE if kind == "moved" else 0
+        if template.source_visit == t:
+            numbers += _numbers(template.splats, template.splats.count)
+        before = jax.tree.map(np.copy, (poses, visible))
+        for leaf in jax.tree.leaves(before):
+            leaf[t, k] = leaf[t - 1, k]
+        other = eqx.tree_at(lambda c: (c.world_from_template, c.visible), chronology, before)
+        found.append((f"object {template.identity} {kind}", numbers, other))
+    if chronology.since is not None and (late := np.asarray(chronology.since) == t).any():
+        logits = np.where(late, -np.inf, np.asarray(chronology.background.logit_opacities))
+        other = eqx.tree_at(lambda c: c.background.logit_opacities, chronology, logits)
+        found.append(("ground", _numbers(chronology.background, int(late.sum())), other))
+    if (dark := _unlit(chronology, t)) is not None:
+        found.append(("light and shadows", *dark))
+    return found
+
+
+def _unlit(chronology: Chronology, t: int) -> tuple[int, Chronology] | None:
+    """How many numbers the light that changed at visit t takes, and the chronology with objects lit as they were first
+    seen and the ground as at the visit before; None where there are none."""
+    numbers = 0
+    if chronology.shade is not None:
+        shade = np.array(chronology.shade)
+        numbers += _SHADE * int((shade[t] != shade[t - 1]).any(axis=-1).sum())
+        shade[t] = shade[t - 1]
+        chronology = eqx.tree_at(lambda c: c.shade, chronology, shade)
+    if chronology.shadows is not None:
+        cast = np.array(chronology.shadows.cast)
+        numbers += _BLOB * int((cast[t] & ~cast[:t].any(axis=0)).sum())
+        cast[t] = cast[t - 1]
+        chronology = eqx.tree_at(lambda c: c.shadows.cast, chronology, cast)
+    return (numbers, chronology) if numbers else None
+
+
+def _numbers(splats: Splats, count: int) -> int:
+    """Parameters of so many of these splats."""
+    return count * sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(splats))
+
+
+def _error(chronology: Chronology, t: int, views: Sequence[VisitView], eye: Eye) -> float:
+    """Mean squared error of the scene of visit t over photographs of it."""
+    scene = drop_hidden(composed(chronology, t))
+    total, count = 0.0, 0
+    for v in views:
+        difference = eye.image(scene, v.view.camera) - np.asarray(v.view.image, np.float32) / 255
+        total += float(np.sum(np.mean(difference**2, axis=-1)[v.view.mask]))
+        count += int(v.view.mask.sum())
+    return total / max(count, 1)
