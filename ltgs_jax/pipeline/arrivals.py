@@ -25,6 +25,7 @@ from ltgs_jax.template import (
     explained,
     firm_part,
     make_crop,
+    middle_of,
     place_template,
     search_template,
     settle_template,
@@ -46,6 +47,7 @@ _APART = 0.2  # share of the smaller of two outlines, up to which they may overl
 _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on it is a shape: of shreds it is half
 _CLINGS = 0.3  # distance, in sizes of a new object, to what stands there, within which it is a patch of that
 _FLOATS = 0.25  # height of the lowest of a new object, in its sizes, from which on nothing carries it
+_SHADE_LENGTH = 2.0  # in sizes of an object: how far from its middle its shadow reaches
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -175,7 +177,7 @@ def _place_known(
         found = placements[i, k]
         state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)
         kind = "moved" if k in gone else "added"
-        accounts.append(Account(k, kind, found.gain, found.error, arrivals[i].instance.views))
+        accounts.append(Account.of_placed(k, kind, found, arrivals[i].instance.views))
         known.append((arrivals[i], k))
     return state, accounts, known, rest
 
@@ -386,15 +388,18 @@ def _add_new(
     views = arrival.instance.views
     height = arrival.support.height(np.asarray(splats.means, np.float64))
     bared = arrival.bared > _BARED
-    ground, shade = ground_shade(splats[new.firm], arrival.support, state.chronology.background, bared=arrival.bared)
+    firm = splats[new.firm]
+    unshaded = _left_beside(state, t, np.asarray(firm.means, np.float64))
+    known = state.chronology.background
+    ground, shade = ground_shade(firm, arrival.support, known, bared=arrival.bared, unshaded=unshaded)
     if ground or (ground is None and bared):
         if shade < 1 and not bared:
             progress.note(f"visit {t}: a shadow in {views} photographs, left out")
             return state, None
-        progress.note(f"visit {t}: ground that was hidden before, from {views} photographs")
+        progress.note(f"visit {t}: ground that was hidden or in shadow before, from {views} photographs")
         flat = height < _LOW * template_diameter(splats)  # what floats above it is no ground
         return _with_ground(state, t, splats[flat], doubt), None
-    object_splats = splats[new.firm]
+    object_splats = firm
     low = height < _LOW * template_diameter(object_splats)
     state = _with_ground(state, t, splats[~new.firm & low], doubt)
     whole = _part_of(state, t, object_splats)
@@ -410,6 +415,22 @@ def _add_new(
     template = Template(object_splats, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
+
+
+def _left_beside(state: State, t: int, points: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether something stood so close to points, before visit t and not any more, that its shadow may have lain
+    there."""
+    middle = np.median(points, axis=0) if len(points) else np.full(3, np.inf)
+    visible, poses = np.asarray(state.chronology.visible), state.chronology.world_from_template
+    for k, template in enumerate(state.chronology.templates):
+        reach = _SHADE_LENGTH * template_diameter(template.splats)
+        stood = middle_of(np.asarray(template.splats.means, np.float64))
+        places = [np.asarray(poses[s, k].apply(jnp.asarray(stood[None], jnp.float32)))[0] for s in range(t + 1)]
+        for s in np.flatnonzero(visible[:t, k]):
+            gone = not visible[t, k] or np.linalg.norm(places[s] - places[t]) > 0.5 * reach
+            if gone and np.linalg.norm(places[s] - middle) < reach:
+                return True
+    return False
 
 
 def _shown(state: State, t: int, k: int, observations, *, eye: Eye) -> float:

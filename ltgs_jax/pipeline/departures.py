@@ -29,6 +29,7 @@ from .state import (
     cut_background,
     extend_background,
     extend_template,
+    hand_over,
     next_identity,
     set_from,
     split_template,
@@ -82,8 +83,15 @@ def take_out(
             continue
         upper = _taken_down(state, k, left, stayed, least, config)
         if upper is not None:
-            part, level = upper
-            state = split_template(state, k, part, level)
+            part, support = upper
+            # What the second look takes down as well is the foot of what the first did.
+            joined = next((j for j in before if _went_along(state, t, j, k)), None)
+            if joined is not None:
+                state = hand_over(state, k, part, joined)
+                foot = _level_below(state.chronology.templates[joined].splats, support)
+                state = eqx.tree_at(lambda s, j=joined: s.supports[j], state, foot)
+                continue
+            state = split_template(state, k, part, _level_below(state.chronology.templates[k].splats[part], support))
             left, stayed, k = left[part], stayed[part], len(state.chronology.templates) - 1
         if share_of(left, stayed) > config.template.whole:
             gone[k] = share_of(left, stayed)
@@ -108,16 +116,29 @@ def take_out(
 def _taken_down(
     state: State, k: int, left: Float[np.ndarray, " m"], stayed: Float[np.ndarray, " m"], least: float, config: Config
 ) -> tuple[Bool[np.ndarray, " m"], Support] | None:
-    """The part of a template that was taken down from upon the rest, and the level it stood on; None where it left as
+    """The part of a template that was taken down from upon the rest, and the surface below both; None where it left as
     a whole. What was carried together is one template until then."""
     support = state.supports[k]
     if support is None:
         return None
     points = np.asarray(state.chronology.templates[k].splats.means, np.float64) @ support.frame().T
     part = taken_down(points, left, stayed, least=least, config=config.template)
-    if part is None:
-        return None
-    return part, Support(support.normal, float(np.quantile(points[part, 2], 0.02)), support.noise)
+    return None if part is None else (part, support)
+
+
+def _level_below(splats: Splats, support: Support) -> Support:
+    """The plane, parallel to a surface, that a part of what stood on that stood on itself."""
+    heights = np.asarray(splats.means, np.float64) @ support.normal
+    return Support(support.normal, float(np.quantile(heights, 0.02)), support.noise)
+
+
+def _went_along(state: State, t: int, j: int, k: int) -> bool:
+    """Whether template j has stood as template k in the same frame at all visits before t, and stands so no more."""
+    poses, visible = state.chronology.world_from_template, np.asarray(state.chronology.visible)
+    alike = all(np.array_equal(leaf[:t, j], leaf[:t, k]) for leaf in (poses.quat, poses.xyz, visible))
+    sources = (state.chronology.templates[i].source_visit for i in (j, k))
+    moved = np.asarray(poses.xyz)[:t, k].any()
+    return bool(alike and moved and len(set(sources)) == 1 and not visible[t, j] and visible[t, k])
 
 
 def _streaks(

@@ -10,18 +10,19 @@ from ltgs_jax.template import Support
 _FLAT = 0.3  # height over width up to which something may be the ground itself
 _TINT = 0.05  # difference of chromaticity up to which it is: shadows keep the colour of what they fall on
 _SHADED = (0.4, 1.05)  # brightness of a shadow over that of the ground around
+_LIT = 0.55  # by which ground may be brighter than that, where the shadow of something that left may have lain
 _FEW = 8  # splats with fewer of which nothing is told
 _OPAQUE = 0.3
 
 
 def ground_shade(
-    splats: Splats, support: Support, background: Splats, *, bared: float = 0.0
+    splats: Splats, support: Support, background: Splats, *, bared: float = 0.0, unshaded: bool = False
 ) -> tuple[bool | None, float]:
     """Whether splats are the ground itself, and their brightness over that of the ground around them.
 
     `support` the surface below, `background` everything else that is known, `bared` the share of what they show that
-    something else had hidden before: the more, the more tint and brightness may differ. None, 1 where too little is
-    known to tell.
+    something else had hidden before: the more, the more tint and brightness may differ. `unshaded`: something left
+    close by, and may have taken a shadow along. None, 1 where too little is known to tell.
     """
     means = np.asarray(splats.means, np.float64)
     around = None if splats.count < _FEW else _color_around(means, support, background)
@@ -32,7 +33,7 @@ def ground_shade(
     tint = np.median(np.abs(_chromaticity(colors) - _chromaticity(around)).max(axis=-1))
     shade = float(np.median(colors.sum(axis=-1)) / max(around.sum(), 0.05))
     flat = np.median(support.height(means)) <= _FLAT * width
-    shaded = _SHADED[0] * (1 - bared) < shade < _SHADED[1] + bared
+    shaded = _SHADED[0] * (1 - bared) < shade < _SHADED[1] + max(bared, _LIT * unshaded)
     return bool(flat and shaded and tint < _TINT * (1 + bared)), shade
 
 

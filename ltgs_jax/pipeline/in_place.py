@@ -19,6 +19,7 @@ from .looks import Evidence, Eye, Observation, compare, unlike_where_different
 from .state import Account, State, came_to_place, scene_at, set_from
 
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
+_OFF = 1.0  # mean score, in deviations, of an object's pixels, too little for each, from which on the whole is doubted
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
 _TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
 
@@ -94,7 +95,7 @@ def turn_in_place(
             continue
         state = set_from(state, t, k, visible=True, pose=pose, unsure=config.detect.moved)
         progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
-        accounts.append(Account(k, "moved", found.gain, found.error, views))
+        accounts.append(Account.of_placed(k, "moved", found, views))
     return state, accounts, stood
 
 
@@ -110,7 +111,9 @@ def _stood_so(
 
 
 def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
-    """Templates that seemed to leave, and those on or beside which two photographs or more show that a part changed."""
+    """Templates that seemed to leave, those on or beside which two photographs or more show that a part changed, and
+    those that look a little otherwise than expected all over: what moved before is expected to look worse, and a turn
+    that every pixel lets pass is told by all of them."""
     scene = scene_at(state, t)
     for k in range(len(state.chronology.templates)):
         if k in gone:
@@ -120,7 +123,9 @@ def _turned_candidates(state: State, t: int, gone: dict[int, float], observation
             areas = [max(c.sum(), 1) for c in cover]
             near = [dilate(c, max(1, round(_BESIDE * area**0.5))) for c, area in zip(cover, areas, strict=True)]
             changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
-            if sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2:
+            partly = sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2
+            scores = [change.score[c].mean() for change, c in zip(evidence.changes, cover, strict=True) if c.any()]
+            if partly or (len(scores) >= 2 and np.mean(scores) > _OFF):
                 yield k
 
 

@@ -209,7 +209,9 @@ def _track(chronology: Chronology, k: int, accounts: Sequence[Sequence[Account]]
                 "confidence": round(_confidence(account), 3) if account is not None else (1.0 if known else 0.5),
                 "inliers": account.views if account is not None else 0,
                 "residual": account.residual if gain is not None else 0.0,
-                "ambiguous_axis": None,
+                "ambiguous_axis": None
+                if account is None or account.ambiguous_axis is None
+                else [*account.ambiguous_axis],
             }
         )
     return {

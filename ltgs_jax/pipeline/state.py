@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from ltgs_jax.geometry import SE3
 from ltgs_jax.io import arrays_of, module_of
 from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, concatenate_splats
-from ltgs_jax.template import Support
+from ltgs_jax.template import Placement, Support
 
 from .looks import on_host
 
@@ -38,13 +38,26 @@ class State(eqx.Module):
 
 class Account(eqx.Module):
     """How one object was explained at one visit: kind, share of the change explained, what is left unlike the
-    photographs, and over how many photographs."""
+    photographs, over how many photographs, and the axis [3] in its template's frame about which its turn is unknown."""
 
     template: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
     gain: float = eqx.field(static=True)
     residual: float = eqx.field(static=True)
     views: int = eqx.field(static=True)
+    ambiguous_axis: tuple[float, ...] | None = eqx.field(static=True, default=None)
+
+    @classmethod
+    def of_placed(cls, template: int, kind: str, found: Placement, views: int) -> "Account":
+        """Of a template that was found again."""
+        axis = None if found.ambiguous_axis is None else tuple(map(float, found.ambiguous_axis))
+        return cls(template, kind, found.gain, found.error, views, axis)
+
+    @classmethod
+    def from_json(cls, entry: dict) -> "Account":
+        """What `to_json` gave."""
+        axis = entry.get("ambiguous_axis")
+        return cls(**{**entry, "ambiguous_axis": None if axis is None else tuple(axis)})
 
     def to_json(self) -> dict:
         """As JSON holds it."""
@@ -54,6 +67,7 @@ class Account(eqx.Module):
             "gain": float(self.gain),
             "residual": float(self.residual),
             "views": self.views,
+            "ambiguous_axis": self.ambiguous_axis,
         }
 
 
@@ -151,6 +165,15 @@ def split_template(state: State, k: int, part: Bool[np.ndarray, " m"], support: 
     )
 
 
+def hand_over(state: State, k: int, part: Bool[np.ndarray, " m"], to: int) -> State:
+    """A part of template k as more of another, whose frame and poses so far are the same."""
+    whole, errors = state.chronology.templates[k].splats, state.template_errors[k]
+    rest = eqx.tree_at(
+        lambda s: (s.chronology.templates[k].splats, s.template_errors[k]), state, (whole[~part], errors[~part])
+    )
+    return extend_template(rest, to, whole[part], errors[part])
+
+
 def drop_template(state: State, k: int) -> State:
     """The state without template k; those after it move up by one."""
     chronology = state.chronology
@@ -174,7 +197,7 @@ def _with_templates(state: State, templates, poses: SE3, visible, errors, suppor
 
 
 def extend_template(state: State, k: int, splats: Splats, errors: np.ndarray) -> State:
-    """More splats, in world coordinates, for a template whose frame is the world's."""
+    """More splats, in its own frame, for a template."""
     joined = concatenate_splats([state.chronology.templates[k].splats, splats])
     return eqx.tree_at(
         lambda s: (s.chronology.templates[k].splats, s.template_errors[k]),

@@ -217,7 +217,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
         return arrays, {**notes, "accounts": [a.to_json() for a in accounts], "counts": counts}
 
     arrays, notes = store.run(f"visit_{t:03d}", key, compute)
-    return unpack_state(arrays, notes, run.capture.visits), [Account(**a) for a in notes["accounts"]]
+    return unpack_state(arrays, notes, run.capture.visits), [Account.from_json(a) for a in notes["accounts"]]
 
 
 def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress) -> Chronology:

@@ -1,5 +1,6 @@
 """One visit: what its photographs show that the scene does not, explained by the cheapest account they support."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -159,8 +160,8 @@ def _put_back(
         template, errors = state.chronology.templates[k], state.template_errors[k]
         state = extend_background(drop_template(state, k), template.splats, errors, np.zeros(len(errors), bool), 0)
         final = {
-            a.template - (a.template > k): Account(a.template - (a.template > k), a.kind, a.gain, a.residual, a.views)
-            for a in final.values()
+            a.template: a
+            for a in (dataclasses.replace(a, template=a.template - (a.template > k)) for a in final.values())
         }
     return state, [final[k] for k in sorted(final)]
 

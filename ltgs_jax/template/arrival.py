@@ -40,13 +40,15 @@ _PARALLEL = np.radians(8)  # between the normals of two surfaces, up to which th
 _LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other than this are taken for one
 _LEANS = np.radians(20)  # from the normal, beyond which something lies on another side
 _LEVEL_MARGIN = 0.03  # by which it may look worse upright and still be taken to stand so
+_ALIKE = 0.5  # share of what a pose explains that every other turn must explain for the turn to be unknown
 _AGREE = 0.06  # difference of colours at which two photographs hardly show one surface
 
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
     its outlines that nothing speaks against, its structural likeness to the photographs, the share of what changed
-    clearly that its outlines cover, and its outlines in the windows."""
+    clearly that its outlines cover, its outlines in the windows, and the axis in the template's frame about which any
+    turn explains the change as well (None: one does better than others)."""
 
     world_from_template: SE3
     error: float
@@ -55,6 +57,7 @@ class Placement(eqx.Module):
     likeness: float
     recall: float
     outlines: Bool[np.ndarray, "v s s"]
+    ambiguous_axis: Float[np.ndarray, "3"] | None = None
 
     @property
     def worth(self) -> float:
@@ -221,12 +224,24 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     chosen, _ = _polished(search, chosen, None, crop, size, refiner, _ROUNDS - half, width=_FINER)
     best = place_template(search, chosen, crop, size=size, refiner=refiner)
     upright = levelled(best.world_from_template, search)
-    if upright is None:
-        return best
-    pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
-    if error > best.error * (1 + _LEVEL_MARGIN):
-        return best
-    return place_template(search, pose, crop, size=size, refiner=refiner)
+    if upright is not None:
+        pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
+        if error <= best.error * (1 + _LEVEL_MARGIN):
+            best = place_template(search, pose, crop, size=size, refiner=refiner)
+    axis = search.stood_on.normal if _looks_alike(search, best.world_from_template, crop, size, refiner) else None
+    return eqx.tree_at(lambda p: p.ambiguous_axis, best, axis, is_leaf=lambda leaf: leaf is None)
+
+
+def _looks_alike(search: Search, pose: SE3, crop: Crop, size: float, refiner: Refiner) -> bool:
+    """Whether a template explains the windows about as well at every other turn about the normal of what it stood on,
+    lit as they show it: a plain cylinder does."""
+    axis = np.asarray(pose.as_matrix(), np.float64)[:3, :3] @ search.stood_on.normal
+    turned = turned_round(pose, search.template, axis, _TURNS)
+    images, cover = refiner.images(search.template, turned, crop, 0.1 * size)
+    gains = [
+        explained(relit(image, shown, crop, freely=True), crop)[1] for image, shown in zip(images, cover, strict=True)
+    ]
+    return min(gains) > _ALIKE * max(gains[0], 0)
 
 
 def _polished(

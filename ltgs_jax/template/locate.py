@@ -178,20 +178,22 @@ def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s
 
 
 def relit(
-    images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop
+    images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop, *, freely: bool = False
 ) -> Float[np.ndarray, "v s s 3"]:
     """Composites with the template lit as the photographs show it: in each view a gain on what it covers, log-linear
-    over the window, fitted to the photograph. A print that is wrong stays wrong; a shade that turned with the object
-    does not."""
+    over the window (log-quadratic, and without restraint, if `freely`), fitted to the photograph. A print that is wrong
+    stays wrong; a shade that turned with the object does not."""
     target, grey = np.asarray(crop.target).mean(axis=-1), images.mean(axis=-1)
     rows, columns = np.mgrid[-1 : 1 : 1j * grey.shape[1], -1 : 1 : 1j * grey.shape[2]]
-    basis = np.stack([np.ones_like(rows), columns, rows], axis=-1)
+    linear = [np.ones_like(rows), columns, rows]
+    basis = np.stack(linear + [columns**2, columns * rows, rows**2] * freely, axis=-1)
+    prior = (1e-4 if freely else _TIMID) * np.eye(basis.shape[-1])
     shown = (cover > 0.5) & np.asarray(crop.valid)
     lit = []
     for image, g, t, c, mask in zip(images, grey, target, cover, shown, strict=True):
         wanted = np.clip(np.log((t[mask] + _DARK) / (g[mask] + _DARK)), -1, 1)
         near = basis[mask]
-        system = near.T @ near + _TIMID * max(len(near), 1) * np.eye(3)
+        system = near.T @ near + max(len(near), 1) * prior
         gain = np.exp(np.clip(basis @ np.linalg.solve(system, near.T @ wanted), -_GAIN, _GAIN))
         lit.append(image * (1 + c * (gain - 1))[..., None])
     return np.stack(lit)
