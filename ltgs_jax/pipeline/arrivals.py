@@ -33,7 +33,7 @@ from ltgs_jax.template import (
 )
 
 from .config import Config
-from .ground import ground_shade
+from .ground import ground_shade, light_alone
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
 from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
 
@@ -52,13 +52,15 @@ _LOW = 0.1  # height, in diameters of a new object, under which what mends the s
 
 
 class Arrival(eqx.Module):
-    """Something that came: its volume and outlines, the surface below, windows around it, and the share of it that may
-    be ground that nobody saw before: it was guessed, or something stood there and left."""
+    """Something that came: its volume and outlines, the surface below, windows around it, the share of it that may
+    be ground that nobody saw before, since it was guessed, or something stood there and left, and the gain on the
+    colours that were there, if that is all."""
 
     instance: Instance
     support: Support
     crop: Crop
     bared: float
+    light: float | None
 
 
 class NewObject(eqx.Module):
@@ -132,7 +134,9 @@ def _arrivals_of(
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
         crop = crop_around(instance, observations, evidence, config)
-        arrivals.append(Arrival(instance, support, crop, float(share)))
+        changed = [r & m & o.valid for r, m, o in zip(instance.regions, evidence.masks, observations, strict=True)]
+        light = light_alone([o.image for o in observations], [look.image for look in evidence.looks], changed)
+        arrivals.append(Arrival(instance, support, crop, float(share), light))
     return arrivals
 
 
@@ -392,6 +396,8 @@ def _add_new(
     unshaded = _left_beside(state, t, np.asarray(firm.means, np.float64))
     known = state.chronology.background
     ground, shade = ground_shade(firm, arrival.support, known, bared=arrival.bared, unshaded=unshaded)
+    if arrival.light is not None:
+        ground, shade = True, arrival.light
     if ground or (ground is None and bared):
         if shade < 1 and not bared:
             progress.note(f"visit {t}: a shadow in {views} photographs, left out")

@@ -1,7 +1,9 @@
 """Shadows and bared ground told from things: they lie flat, and have the colour of the ground around."""
 
+from collections.abc import Sequence
+
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ltgs_jax.geometry import C0
 from ltgs_jax.scene import Splats
@@ -11,6 +13,9 @@ _FLAT = 0.3  # height over width up to which something may be the ground itself
 _TINT = 0.05  # difference of chromaticity up to which it is: shadows keep the colour of what they fall on
 _SHADED = (0.4, 1.05)  # brightness of a shadow over that of the ground around
 _LIT = 0.55  # by which ground may be brighter than that, where the shadow of something that left may have lain
+_ENOUGH = 30  # pixels of a photograph that tell whether only light changed there
+_ALL_ALIKE = (0.08, 0.2)  # log ratio of its colours to those before: channels apart, and pixels apart, where it did
+_DARK = 0.05  # floor of ratios of colours
 _FEW = 8  # splats with fewer of which nothing is told
 _OPAQUE = 0.3
 
@@ -35,6 +40,29 @@ def ground_shade(
     flat = np.median(support.height(means)) <= _FLAT * width
     shaded = _SHADED[0] * (1 - bared) < shade < _SHADED[1] + max(bared, _LIT * unshaded)
     return bool(flat and shaded and tint < _TINT * (1 + bared)), shade
+
+
+def light_alone(
+    images: Sequence[Float[np.ndarray, "h w 3"]],
+    before: Sequence[Float[np.ndarray, "h w 3"]],
+    changed: Sequence[Bool[np.ndarray, "h w"]],
+) -> float | None:
+    """The gain that explains a change in all photographs that show enough of it, if one for all channels and pixels of
+    each does: a shadow came or left, and nothing else. A thing has edges, a print and a tint of its own.
+    """
+    gains, counts = [], []
+    for image, known, mask in zip(images, before, changed, strict=True):
+        if mask.sum() < _ENOUGH:
+            continue
+        ratio = np.log((image[mask] + _DARK) / (known[mask] + _DARK))
+        grey = ratio.mean(axis=-1)
+        tint = np.median(np.abs(ratio - grey[:, None]).max(axis=-1))
+        spread = 1.4826 * np.median(np.abs(grey - np.median(grey)))
+        if tint > _ALL_ALIKE[0] or spread > _ALL_ALIKE[1]:
+            return None
+        gains.append(np.median(grey))
+        counts.append(mask.sum())
+    return float(np.exp(np.average(gains, weights=counts))) if gains else None
 
 
 def _color_around(
