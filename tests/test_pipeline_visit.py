@@ -1,0 +1,128 @@
+"""What a visit's evidence is taken for: light or a thing, a burden or its foot, turned or as it stood."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ltgs_jax.detect import ChangeMap
+from ltgs_jax.geometry import C0, SE3, Camera
+from ltgs_jax.pipeline.arrivals import _left_beside
+from ltgs_jax.pipeline.departures import _level_below, _went_along
+from ltgs_jax.pipeline.ground import ground_shade, light_alone
+from ltgs_jax.pipeline.in_place import _turned_candidates
+from ltgs_jax.pipeline.looks import Evidence, Eye, Observation
+from ltgs_jax.pipeline.state import Account, State, add_template, hand_over, set_from, split_template
+from ltgs_jax.scene import Splats, Template
+from ltgs_jax.template import Placement, Support
+
+_FLOOR = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
+
+
+def _box(rng, count: int, low, high, color=(0.5, 0.5, 0.5)) -> Splats:
+    means = rng.uniform(low, high, (count, 3)).astype(np.float32)
+    sh = np.tile(((np.float32(color) - 0.5) / C0)[None, None], (count, 1, 1)).astype(np.float32)
+    quats, scales = np.tile(np.float32([1, 0, 0, 0]), (count, 1)), np.full((count, 3), np.log(0.02), np.float32)
+    return Splats(means, quats, scales, np.full(count, 3, np.float32), sh)
+
+
+def _shifted(x: float) -> SE3:
+    return SE3(jnp.asarray([1.0, 0, 0, 0]), jnp.asarray([x, 0.0, 0]))
+
+
+@pytest.fixture
+def state() -> State:
+    """A floor, and a thing upon another that moved together at the second of four visits."""
+    rng = np.random.default_rng(2)
+    floor = _box(rng, 400, [-1, -1, 0], [1, 1, 0], (0.6, 0.45, 0.3))
+    start = State.of_initial(floor, np.zeros(400, np.float32), ("a", "b", "c", "d"))
+    book, mug = (
+        _box(rng, 100, [-0.2, -0.2, 0], [0.2, 0.2, 0.05]),
+        _box(rng, 80, [-0.05, -0.05, 0.05], [0.05, 0.05, 0.2]),
+    )
+    stack = Splats(*(np.concatenate(pair) for pair in zip(vars(book).values(), vars(mug).values(), strict=True)))
+    there = add_template(start, Template(stack, 1, 0), np.zeros(180, np.float32), _FLOOR, 0)
+    return set_from(there, 1, 0, visible=True, pose=_shifted(0.6))
+
+
+def test_one_gain_over_all_photographs_is_light_and_nothing_else_is():
+    rng = np.random.default_rng(0)
+    wood = [0.5 + 0.1 * rng.normal(size=(40, 40, 1)) * [1, 0.8, 0.5] for _ in range(3)]
+    mask = np.zeros((40, 40), bool)
+    mask[10:25, 10:25] = True
+    masks = [mask] * 3
+    for gain in (0.6, 1.4):
+        found = light_alone([np.where(mask[..., None], gain * w, w) for w in wood], wood, masks)
+        assert found == pytest.approx(gain, rel=0.1)
+    printed = 0.3 + 0.4 * (rng.uniform(size=(40, 40, 1)) > 0.5) * np.ones(3)
+    assert light_alone([np.where(mask[..., None], printed, w) for w in wood], wood, masks) is None
+    plain = np.full((40, 40, 3), [0.5, 0.3, 0.6])
+    assert light_alone([np.where(mask[..., None], plain, w) for w in wood], wood, masks) is None
+    # One photograph in which it is a thing is enough, one that shows too little of it says nothing.
+    shadows = [np.where(mask[..., None], 0.6 * w, w) for w in wood]
+    assert light_alone([printed, *shadows[1:]], wood, masks) is None
+    few = np.zeros((40, 40), bool)
+    few[:4, :4] = True
+    assert light_alone([printed, *shadows[1:]], wood, [few, mask, mask]) is not None
+    assert light_alone(shadows, wood, [few] * 3) is None
+
+
+def test_bright_ground_is_ground_only_where_a_shadow_may_have_left():
+    rng = np.random.default_rng(1)
+    floor = _box(rng, 800, [-1, -1, 0], [1, 1, 0], (0.5, 0.4, 0.3))
+    patch = _box(rng, 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.004], (0.65, 0.52, 0.39))
+    assert ground_shade(patch, _FLOOR, floor, unshaded=True)[0] is True
+    assert ground_shade(patch, _FLOOR, floor)[0] is False
+    other = _box(rng, 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.004], (0.3, 0.5, 0.75))
+    assert ground_shade(other, _FLOOR, floor, unshaded=True)[0] is False
+
+
+def test_a_shadow_may_have_left_only_beside_where_something_stood(state):
+    beside, far = np.full((5, 3), [0.3, 0.2, 0]), np.full((5, 3), [-4.0, 0, 0])
+    assert _left_beside(state, 1, beside)
+    assert not _left_beside(state, 1, far)
+    still = set_from(state, 1, 0, visible=True, pose=_shifted(0.0))
+    assert not _left_beside(still, 1, beside)
+
+
+def test_the_foot_of_what_was_taken_down_joins_it(state):
+    heights = np.asarray(state.chronology.templates[0].splats.means)[:, 2]
+    upper = heights > 0.1
+    parted = split_template(state, 0, upper, _level_below(state.chronology.templates[0].splats[upper], _FLOOR))
+    parted = set_from(parted, 2, 1, visible=False)
+    assert _went_along(parted, 2, 1, 0)
+    assert not _went_along(set_from(parted, 1, 0, visible=True, pose=_shifted(0.3)), 2, 1, 0)
+    foot = np.asarray(parted.chronology.templates[0].splats.means)[:, 2] > 0.05
+    joined = hand_over(parted, 0, foot, 1)
+    book, mug = (m.splats for m in joined.chronology.templates)
+    assert (book.count, mug.count) == (100, 80)
+    assert [len(e) for e in joined.template_errors] == [100, 80]
+    level = _level_below(mug, _FLOOR)
+    assert 0.045 < level.offset < 0.06 < _level_below(parted.chronology.templates[1].splats, _FLOOR).offset
+
+
+def test_what_looks_a_little_otherwise_all_over_is_looked_at_turned(state):
+    eye, K = Eye(), jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    down = SE3(jnp.asarray([0.0, 1, 0, 0]), jnp.asarray([-0.3, 0.0, 2.5]))  # above the table, looking at it
+    observations = [
+        Observation(f"c/{i}.png", Camera(down, K, 64, 48), np.zeros((48, 64, 3)), np.ones((48, 64), bool))
+        for i in (0, 1)
+    ]
+
+    def candidates(*scores: float) -> list[int]:
+        nothing = np.zeros((48, 64), bool)
+        changes = [ChangeMap(np.full((48, 64), s, np.float32), np.zeros((48, 64)), nothing, False) for s in scores]
+        seen = observations[: len(scores)]
+        return list(_turned_candidates(state, 2, {}, seen, Evidence((), tuple(changes)), eye=eye))
+
+    assert candidates(1.8, 0.9) == [0]
+    assert candidates(0.9, 0.4) == []
+    assert candidates(3.0) == []  # one photograph may be wrong all over
+
+
+def test_an_account_keeps_the_axis_through_json():
+    outlines = np.zeros((1, 2, 2), bool)
+    found = Placement(SE3.identity(), 0.1, 0.5, 1.0, 0.6, 0.9, outlines, np.array([0.0, 0, 1]))
+    account = Account.of_placed(3, "moved", found, 2)
+    assert account.ambiguous_axis == (0, 0, 1)
+    assert Account.from_json(account.to_json()) == account
+    assert Account.from_json({**account.to_json(), "ambiguous_axis": None}).ambiguous_axis is None
