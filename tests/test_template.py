@@ -25,7 +25,7 @@ from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypothes
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.locate import freedoms_of, relit
-from ltgs_jax.template.removal import gone_evidence, taken_down
+from ltgs_jax.template.removal import gone_evidence, taken_down, with_foot
 
 
 def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
@@ -213,6 +213,25 @@ def test_a_box_that_turned_beside_covered_ground_goes_and_the_ground_stays():
     assert len(found) == 1
     assert found[0].members[on_box].mean() > 0.9
     assert found[0].members[covered & (means[:, 0] > 0.2)].sum() == 0
+
+
+def test_the_level_that_a_burden_stood_on_is_that_of_what_is_beside_it():
+    rng = np.random.default_rng(6)
+    book = rng.uniform([-0.2, -0.15, 0], [0.2, 0.15, 0.05], (400, 3))
+    ball = rng.normal(size=(500, 3))
+    ball = 0.1 * ball / np.linalg.norm(ball, axis=1, keepdims=True) + [0, 0, 0.15]
+    points = np.concatenate([book, ball])
+    on_ball = np.arange(len(points)) >= len(book)
+    upper = points[:, 2] > 0.15  # cut at its widest
+    part, level = with_foot(points, upper)
+    assert 0.045 < level < 0.055
+    assert part[on_ball].mean() > 0.9 and part[~on_ball].mean() < 0.05
+    narrow = np.concatenate(
+        [rng.uniform([-0.05, -0.05, 0], [0.05, 0.05, 0.1], (200, 3)), ball + np.array([0, 0, 0.05])]
+    )
+    kept, level = with_foot(narrow, narrow[:, 2] > 0.2)  # nothing reaches beside the ball: its own lowest tells
+    assert level == np.quantile(narrow[narrow[:, 2] > 0.2, 2], 0.02)
+    np.testing.assert_array_equal(kept, narrow[:, 2] > 0.2)
 
 
 def test_nothing_changed_nothing_removed():

@@ -18,6 +18,7 @@ from ltgs_jax.template import (
     gone_evidence,
     share_of,
     taken_down,
+    with_foot,
 )
 
 from .config import Config
@@ -88,10 +89,10 @@ def take_out(
             joined = next((j for j in before if _went_along(state, t, j, k)), None)
             if joined is not None:
                 state = hand_over(state, k, part, joined)
-                foot = _level_below(state.chronology.templates[joined].splats, support)
-                state = eqx.tree_at(lambda s, j=joined: s.supports[j], state, foot)
+                lower = min(support, state.supports[joined], key=lambda level: level.offset)
+                state = eqx.tree_at(lambda s, j=joined: s.supports[j], state, lower)
                 continue
-            state = split_template(state, k, part, _level_below(state.chronology.templates[k].splats[part], support))
+            state = split_template(state, k, part, support)
             left, stayed, k = left[part], stayed[part], len(state.chronology.templates) - 1
         if share_of(left, stayed) > config.template.whole:
             gone[k] = share_of(left, stayed)
@@ -116,20 +117,17 @@ def take_out(
 def _taken_down(
     state: State, k: int, left: Float[np.ndarray, " m"], stayed: Float[np.ndarray, " m"], least: float, config: Config
 ) -> tuple[Bool[np.ndarray, " m"], Support] | None:
-    """The part of a template that was taken down from upon the rest, and the surface below both; None where it left as
+    """The part of a template that was taken down from upon the rest, and the level it stood on; None where it left as
     a whole. What was carried together is one template until then."""
     support = state.supports[k]
     if support is None:
         return None
     points = np.asarray(state.chronology.templates[k].splats.means, np.float64) @ support.frame().T
     part = taken_down(points, left, stayed, least=least, config=config.template)
-    return None if part is None else (part, support)
-
-
-def _level_below(splats: Splats, support: Support) -> Support:
-    """The plane, parallel to a surface, that a part of what stood on that stood on itself."""
-    heights = np.asarray(splats.means, np.float64) @ support.normal
-    return Support(support.normal, float(np.quantile(heights, 0.02)), support.noise)
+    if part is None:
+        return None
+    part, level = with_foot(points, part)
+    return part, Support(support.normal, level, support.noise)
 
 
 def _went_along(state: State, t: int, j: int, k: int) -> bool:

@@ -22,6 +22,7 @@ from .removal import find_removed as find_removed
 from .removal import gone_evidence as gone_evidence
 from .removal import share_of as share_of
 from .removal import taken_down as taken_down
+from .removal import with_foot as with_foot
 from .support import Support as Support
 from .support import Vantage as Vantage
 from .support import fit_support as fit_support

@@ -15,6 +15,8 @@ from .support import Support, Vantage, convex_footprint, fit_support
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
+_WIDER = 1.2  # by which the outline of the middle 90 % is widened to be that of the whole
+_FEW = 20  # splats beside what was taken down that tell how high the rest is
 _STEP = 1.5  # growth of an outline from which on one thing stands upon another
 
 
@@ -83,6 +85,23 @@ def taken_down(
     ]
     step = int(np.argmax(growth))
     return height > levels[step] if growth[step] > _STEP else None
+
+
+def with_foot(points: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], float]:
+    """A part that was taken down, with its foot, and the level that it stood on: how high the rest reaches beside it.
+    What of the rest is higher, below the part, is its foot; where nothing is beside it, its own lowest is the level.
+
+    `points`: their centres along two axes of the support and its normal.
+    """
+    low, high = np.quantile(points[part, :2], [0.05, 0.95], axis=0)
+    core = part & ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    middle = points[core, :2].mean(axis=0)
+    below = convex_footprint(_WIDER * (points[core, :2] - middle) + middle, points[:, :2])
+    beside = points[~part & ~below, 2]
+    if len(beside) < _FEW:
+        return part, float(np.quantile(points[part, 2], 0.02))
+    level = min(float(np.quantile(beside, 0.95)), float(np.quantile(points[part, 2], 0.02)))
+    return part | (below & (points[:, 2] > level)), level
 
 
 def _extent(points: Float[np.ndarray, "n 3"]) -> float:
