@@ -11,6 +11,8 @@ from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
 from ltgs_jax.pipeline.looks import Evidence, Eye, Observation
+from ltgs_jax.pipeline.outputs import _name_of, _track
+from ltgs_jax.pipeline.reshaped import join_states
 from ltgs_jax.pipeline.state import Account, State, add_template, hand_over, set_from, split_template
 from ltgs_jax.scene import Splats, Template
 from ltgs_jax.template import Placement, Support
@@ -124,3 +126,36 @@ def test_an_account_keeps_the_axis_through_json():
     assert account.ambiguous_axis == (0, 0, 1)
     assert Account.from_json(account.to_json()) == account
     assert Account.from_json({**account.to_json(), "ambiguous_axis": None}).ambiguous_axis is None
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "color", "joined"),
+    [
+        ([0.4, -0.3, 0], [0.8, 0.3, 0.04], (0.5, 0.5, 0.5), True),  # the same, opened
+        ([0.4, -0.3, 0], [0.8, 0.3, 0.04], (0.9, 0.2, 0.1), False),  # something red in its place
+        ([-0.8, -0.3, 0], [-0.4, 0.3, 0.04], (0.5, 0.5, 0.5), False),  # something like it elsewhere
+        ([0.58, -0.02, 0], [0.62, 0.02, 0.04], (0.5, 0.5, 0.5), False),  # something small in its place
+    ],
+)
+def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_state(state, low, high, color, joined):
+    gone = set_from(state, 2, 0, visible=False)
+    came = Template(_box(np.random.default_rng(7), 120, low, high, color), 2, 2)
+    after = add_template(gone, came, np.zeros(120, np.float32), _FLOOR, 2)
+    accounts = [Account(0, "removed", 0.6, 0.1, 3), Account(1, "added", 0.8, 0.1, 3)]
+    after, told = join_states(after, 2, accounts)
+    assert [m.identity for m in after.chronology.templates] == ([1, 1] if joined else [1, 2])
+    assert [a.kind for a in told] == (["new_state"] if joined else ["removed", "added"])
+    every = [[], [Account(0, "moved", 0.5, 0.1, 3)], told, []]
+    track = _track(after.chronology, 1, every)
+    assert [s["event"] for s in track["states"]] == [
+        "moved",
+        "new_state" if joined else "removed",
+        "still" if joined else "unseen",
+    ]
+    assert [s["visible"] for s in track["states"]] == [True, joined, joined]
+    assert _name_of(after.chronology, 1) == ("object_0001_0002.ply" if joined else "object_0002.ply")
+    if joined:
+        assert track["states"][1]["confidence"] == pytest.approx(0.8)
+        # Closed again: the first template is there, and the object changed its state once more.
+        again = set_from(set_from(after, 3, 1, visible=False), 3, 0, visible=True, pose=_shifted(0.6))
+        assert _track(again.chronology, 1, every)["states"][2]["event"] == "new_state"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from ltgs_jax.geometry import SE3, Camera, rotation_angle
 from ltgs_jax.io import (
@@ -45,8 +45,8 @@ def write_outputs(
         scenes = [drop_hidden(compose(chronology, t)) for t in range(len(chronology.visits))]
         for t, scene in enumerate(scenes):
             write_ply(out / "splats" / f"{prefix}_{t:04d}.ply", scene)
-        for template in chronology.templates:
-            write_ply(out / "objects" / f"object_{template.identity:04d}.ply", template.splats)
+        for k, template in enumerate(chronology.templates):
+            write_ply(out / "objects" / _name_of(chronology, k), template.splats)
         write_ply(out / "initial.ply", initial)
         cameras = {p.name: p for p in run.capture.photographs if p.name in run.cameras}
         write_json(
@@ -84,7 +84,8 @@ def write_outputs(
                 entry["mask_path"] = str(Path("masks") / name)
             manifest.append(entry)
         write_json(out / "report.json", {"photographs": manifest})
-        objects = [_track(chronology, k, accounts, run) for k in range(len(chronology.templates))]
+        identities = dict.fromkeys(m.identity for m in chronology.templates)
+        objects = [_track(chronology, identity, accounts) for identity in identities]
         write_tracks(
             out / "tracks.json",
             visits=list(chronology.visits),
@@ -173,55 +174,69 @@ def pose_change(a: SE3, b: SE3, size: float) -> tuple[float, float]:
     return moved, float(rotation_angle(motion.quat / jnp.linalg.norm(motion.quat)))
 
 
-def _track(chronology: Chronology, k: int, accounts: Sequence[Sequence[Account]], run) -> dict:
-    """The entry of one object in tracks.json."""
-    template = chronology.templates[k]
-    means = np.asarray(template.splats.means)
-    low, high = np.quantile(means, [0.01, 0.99], axis=0)
-    size = float(np.linalg.norm(high - low))
-    visible = np.asarray(chronology.visible)[:, k]
-    known = {a.template: (t, a) for t, row in enumerate(accounts) for a in row}
-    states = []
+def _track(chronology: Chronology, identity: int, accounts: Sequence[Sequence[Account]]) -> dict:
+    """The entry of one object in tracks.json: of each visit the template that shows, or showed last, and its pose."""
+    states_of = [k for k, m in enumerate(chronology.templates) if m.identity == identity]
+    visible = np.asarray(chronology.visible)
+    boxes = {k: _box_of(chronology.templates[k].splats) for k in states_of}
+    shown = [next((k for k in states_of if visible[t, k]), None) for t in range(len(chronology.visits))]
+    last, states = next((k for k in shown if k is not None), states_of[0]), []
     for t in range(1, len(chronology.visits)):
-        account = next((a for a in accounts[t] if a.template == k), None) if t < len(accounts) else None
-        before, now = bool(visible[t - 1]), bool(visible[t])
+        before, now = shown[t - 1], shown[t]
+        last = k = last if now is None else now
         pose = chronology.world_from_template[t, k]
+        account = next((a for a in accounts[t] if a.template == k), None) if t < len(accounts) else None
         event = "still"
-        if not now:
-            event = "removed" if before else "unseen"
-        elif not before:
+        if now is None:
+            event = "removed" if before is not None else "unseen"
+        elif before is None:
             event = "added"
+        elif now != before:
+            event = "new_state"
         else:
+            size = float(np.linalg.norm(boxes[k][1] - boxes[k][0]))
             moved, turned = pose_change(chronology.world_from_template[t - 1, k], pose, size)
             if max(moved, turned) > _STILL:
                 event = "moved"
         quat = np.asarray(pose.quat, float)
-        gain = account.gain if account is not None else None
+        axis = None if account is None else account.ambiguous_axis
         states.append(
             {
                 "visit": t,
                 "event": event,
-                "visible": now,
+                "visible": now is not None,
                 "world_from_template": {
                     "wxyz": (quat / np.linalg.norm(quat)).tolist(),
                     "xyz": np.asarray(pose.xyz, float).tolist(),
                 },
-                "confidence": round(_confidence(account), 3) if account is not None else (1.0 if known else 0.5),
-                "inliers": account.views if account is not None else 0,
-                "residual": account.residual if gain is not None else 0.0,
-                "ambiguous_axis": None
-                if account is None or account.ambiguous_axis is None
-                else [*account.ambiguous_axis],
+                "confidence": 1.0 if account is None else round(_confidence(account), 3),
+                "inliers": 0 if account is None else account.views,
+                "residual": 0.0 if account is None else account.residual,
+                "ambiguous_axis": None if axis is None else [*axis],
             }
         )
+    first = chronology.templates[states_of[0]]
+    low, high = boxes[states_of[0]]
     return {
-        "id": template.identity,
-        "source_visit": template.source_visit,
-        "splats": template.splats.count,
+        "id": identity,
+        "source_visit": first.source_visit,
+        "splats": first.splats.count,
         "center": ((low + high) / 2).tolist(),
-        "size": size,
+        "size": float(np.linalg.norm(high - low)),
         "states": states,
     }
+
+
+def _box_of(splats: Splats) -> Float[np.ndarray, "2 3"]:
+    """Corners of the box that holds the central 98 % of splats along each axis."""
+    return np.quantile(np.asarray(splats.means, np.float64), [0.01, 0.99], axis=0)
+
+
+def _name_of(chronology: Chronology, k: int) -> str:
+    """The file of a template: by its object, and for a later state of it by the visit that first showed it too."""
+    template = chronology.templates[k]
+    later = any(m.identity == template.identity for m in chronology.templates[:k])
+    return f"object_{template.identity:04d}{f'_{template.source_visit:04d}' if later else ''}.ply"
 
 
 def _confidence(account: Account) -> float:

@@ -16,6 +16,7 @@ from .config import Config
 from .departures import Remnant, take_out
 from .in_place import turn_in_place
 from .looks import Evidence, Eye, Observation, compare, cone_of, unlike_where_different
+from .reshaped import join_states
 from .state import (
     Account,
     State,
@@ -50,7 +51,8 @@ def explain_visit(
 
     First what left: splats whose every view changed. Then, with that taken out and the ground under it filled, what
     came: outlines that meet in space. Each arrival is a known template at a new pose if one explains the photographs,
-    else a new object. Last, what left is put back where the photographs like that as well.
+    else a new object. Last, what left is put back where the photographs like that as well, and what came in the place
+    of something that left, with its colours, is that in a new state.
     """
     known = len(state.chronology.templates)
     scene = scene_at(state, t)
@@ -100,6 +102,7 @@ def explain_visit(
     state, accounts = _put_back(
         state, t, gone, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
+    state, accounts = join_states(state, t, accounts)
     return _learn_errors(state, t, accounts, observations, front_end, eye, config), accounts, coarse
 
 
@@ -170,7 +173,7 @@ def _learn_errors(
     state: State, t: int, accounts: Sequence[Account], observations, front_end: FrontEnd, eye: Eye, config: Config
 ) -> State:
     """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them."""
-    placed = [a for a in accounts if a.kind in ("moved", "added")]
+    placed = [a for a in accounts if a.kind in ("moved", "added", "new_state")]
     if not placed:
         return state
     splats, _, owner, _ = scene_at(state, t)
