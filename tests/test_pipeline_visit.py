@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from ltgs_jax.detect import ChangeMap
+from ltgs_jax.fit import View, VisitView
 from ltgs_jax.geometry import C0, SE3, Camera
 from ltgs_jax.pipeline.arrivals import _left_beside
 from ltgs_jax.pipeline.departures import _went_along
@@ -12,9 +13,19 @@ from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
 from ltgs_jax.pipeline.looks import Evidence, Eye, Observation
 from ltgs_jax.pipeline.outputs import _name_of, _track
+from ltgs_jax.pipeline.prune import drop_idle
 from ltgs_jax.pipeline.reshaped import join_states
-from ltgs_jax.pipeline.state import Account, State, add_template, hand_over, set_from, split_template
-from ltgs_jax.scene import Splats, Template
+from ltgs_jax.pipeline.state import (
+    Account,
+    State,
+    add_template,
+    composed,
+    extend_background,
+    hand_over,
+    set_from,
+    split_template,
+)
+from ltgs_jax.scene import Splats, Template, drop_hidden
 from ltgs_jax.template import Placement, Support
 
 _FLOOR = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
@@ -159,3 +170,31 @@ def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_
         # Closed again: the first template is there, and the object changed its state once more.
         again = set_from(set_from(after, 3, 1, visible=False), 3, 0, visible=True, pose=_shifted(0.6))
         assert _track(again.chronology, 1, every)["states"][2]["event"] == "new_state"
+
+
+def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state):
+    rng, eye = np.random.default_rng(9), Eye()
+    bright = _box(rng, 200, [-0.9, -0.6, 0.01], [-0.4, 0.6, 0.02], (0.9, 0.9, 0.2))
+    idle = _box(rng, 300, [-0.9, -0.6, -0.4], [-0.4, 0.6, -0.3], (0.9, 0.1, 0.1))  # below the floor
+    floor = _box(rng, 6000, [-1, -1, 0], [1, 1, 0.001], (0.6, 0.45, 0.3))
+    state = extend_background(state, floor, np.zeros(6000, np.float32), np.zeros(6000, bool), 0)
+    for part in (bright, idle):
+        state = extend_background(state, part, np.zeros(part.count, np.float32), np.zeros(part.count, bool), 2)
+    K, down = (
+        jnp.asarray([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]]),
+        SE3(jnp.asarray([0.0, 1, 0, 0]), jnp.asarray([0.2, 0.0, 2.0])),
+    )
+    camera = Camera(down, K, 64, 48)
+    views = []
+    for t in (2, 3):
+        image = np.rint(255 * eye.image(drop_hidden(composed(state.chronology, t)), camera)).astype(np.uint8)
+        views.append(VisitView(View(camera, image, np.ones((48, 64), bool)), t))
+    after, dropped = drop_idle(state, views, eye)
+    since = np.asarray(after.chronology.since)
+    heights = np.asarray(after.chronology.background.means)[since == 2, 2]
+    assert (since == 0).sum() == 6400
+    assert (heights < 0).sum() < 0.1 * 300 and (heights > 0).sum() > 0.9 * 200
+    assert dropped == 500 - (since == 2).sum()
+    assert len(after.errors) == len(after.guessed) == len(since)
+    untouched = State.of_initial(bright, np.zeros(200, np.float32), ("a", "b", "c", "d"))
+    assert drop_idle(untouched, views, eye)[1] == 0

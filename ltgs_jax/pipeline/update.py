@@ -39,6 +39,7 @@ from .looks import Eye, Observation, expected_errors
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
+from .prune import drop_idle
 from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
@@ -229,18 +230,19 @@ def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress
             progress.note("nothing changed: the chronology is the initial scene")
             arrays, notes = pack_state(state)
             return arrays, {**notes, "counts": {"steps": 0}}
-        views = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-        views += _later_views(run, state.chronology, eye, progress)
+        first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
+        later = _later_views(run, state.chronology, eye, progress)
         chronology, losses = fit_chronology(
             state.chronology,
-            views,
+            first + later,
             key=jax.random.key(run.seed + 1),
             config=config.fit.long,
             progress=progress.step,
         )
-        fitted = eqx.tree_at(lambda s: s.chronology, state, chronology)
+        fitted = eqx.tree_at(lambda s: s.chronology, state, jax.tree.map(np.asarray, chronology))
+        fitted, idle = drop_idle(fitted, later, eye)
         arrays, notes = pack_state(fitted)
-        return arrays, {**notes, "counts": {"steps": len(losses)}}
+        return arrays, {**notes, "counts": {"steps": len(losses), "splats_dropped": idle}}
 
     arrays, notes = store.run("fit", key, compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology
