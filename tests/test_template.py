@@ -363,16 +363,16 @@ def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
 
 def test_the_turn_of_a_plain_cylinder_is_not_known_and_its_axis_is_named():
     rng = np.random.default_rng(8)
-    around, up = rng.uniform(0, 2 * np.pi, 4000), rng.uniform(0, 0.2, 4000)
+    around, up = rng.uniform(0, 2 * np.pi, 2600), rng.uniform(0, 0.2, 2600)
     wall = np.stack([0.1 * np.cos(around), 0.1 * np.sin(around), up], axis=-1)
     lid = np.c_[
-        0.1 * np.sqrt(rng.uniform(size=(1200, 1))) * np.c_[np.cos(around), np.sin(around)][:1200], np.full(1200, 0.2)
+        0.1 * np.sqrt(rng.uniform(size=(800, 1))) * np.c_[np.cos(around), np.sin(around)][:800], np.full(800, 0.2)
     ]
     points = np.concatenate([wall, lid])
-    lit = np.concatenate([0.7 + 0.2 * np.sin(around), np.full(1200, 0.9)])
+    lit = np.concatenate([0.7 + 0.2 * np.sin(around), np.full(800, 0.9)])
     template = Template(_splats(points, np.tile(lit[:, None], 3) * [0.9, 0.5, 0.3], 0.008), 1, 0)
     where = _turned(0.7, [0.12, 0.07, 0.0])
-    now = np.concatenate([0.7 + 0.2 * np.sin(around + 0.7), np.full(1200, 0.9)])  # turned, the light where it was
+    now = np.concatenate([0.7 + 0.2 * np.sin(around + 0.7), np.full(800, 0.9)])  # turned, the light where it was
     shown = _splats(np.asarray(where.apply(template.splats.means)), np.tile(now[:, None], 3) * [0.9, 0.5, 0.3], 0.008)
     support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
     search = Search(template.splats, support, support, _turned(0.0, [0.12, 0.07, 0.0])[None], np.zeros(1), 1.0, 1.0)
