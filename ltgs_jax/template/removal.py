@@ -100,7 +100,9 @@ def with_foot(points: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, " n"]) ->
     beside = points[~part & ~below, 2]
     if len(beside) < _FEW:
         return part, float(np.quantile(points[part, 2], 0.02))
-    level = min(float(np.quantile(beside, 0.95)), float(np.quantile(points[part, 2], 0.02)))
+    level = float(np.quantile(beside, 0.95))
+    if level > np.median(points[part, 2]):
+        return part, float(np.quantile(points[part, 2], 0.02))
     return part | (below & (points[:, 2] > level)), level
 
 
