@@ -25,7 +25,6 @@ from ltgs_jax.template import (
     explained,
     firm_part,
     make_crop,
-    middle_of,
     place_template,
     search_template,
     settle_template,
@@ -35,7 +34,17 @@ from ltgs_jax.template import (
 from .config import Config
 from .ground import ground_shade, light_alone
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
-from .state import Account, State, add_template, extend_background, extend_template, next_identity, scene_at, set_from
+from .state import (
+    Account,
+    State,
+    add_template,
+    extend_background,
+    extend_template,
+    middles_of,
+    next_identity,
+    scene_at,
+    set_from,
+)
 
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
@@ -405,20 +414,19 @@ def _add_new(
         progress.note(f"visit {t}: ground that was hidden or in shadow before, from {views} photographs")
         flat = height < _LOW * template_diameter(splats)  # what floats above it is no ground
         return _with_ground(state, t, splats[flat], doubt), None
-    object_splats = firm
-    low = height < _LOW * template_diameter(object_splats)
+    low = height < _LOW * template_diameter(firm)
     state = _with_ground(state, t, splats[~new.firm & low], doubt)
-    whole = _part_of(state, t, object_splats)
+    whole = _part_of(state, t, firm)
     if whole is not None:
         progress.note(f"visit {t}: more of object {state.chronology.templates[whole].identity}, not seen before")
         pose = state.chronology.world_from_template[t, whole]
-        piece = on_host(transform_splats(pose.inverse(), object_splats))
+        piece = on_host(transform_splats(pose.inverse(), firm))
         return extend_template(state, whole, piece, np.full(piece.count, doubt, state.errors.dtype)), None
-    if not _stands(state, t, object_splats, arrival.support):
+    if not _stands(state, t, firm, arrival.support):
         progress.note(f"visit {t}: a change in {views} photographs that floats, or clings to what is there, left out")
         return state, None
-    errors = np.full(object_splats.count, doubt, state.errors.dtype)
-    template = Template(object_splats, next_identity(state), t)
+    errors = np.full(firm.count, doubt, state.errors.dtype)
+    template = Template(firm, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
 
@@ -427,11 +435,9 @@ def _left_beside(state: State, t: int, points: Float[np.ndarray, "n 3"]) -> bool
     """Whether something stood so close to points, before visit t and not any more, that its shadow may have lain
     there."""
     middle = np.median(points, axis=0) if len(points) else np.full(3, np.inf)
-    visible, poses = np.asarray(state.chronology.visible), state.chronology.world_from_template
+    visible = np.asarray(state.chronology.visible)
     for k, template in enumerate(state.chronology.templates):
-        reach = _SHADE_LENGTH * template_diameter(template.splats)
-        stood = middle_of(np.asarray(template.splats.means, np.float64))
-        places = [np.asarray(poses[s, k].apply(jnp.asarray(stood[None], jnp.float32)))[0] for s in range(t + 1)]
+        reach, places = _SHADE_LENGTH * template_diameter(template.splats), middles_of(state, k)
         for s in np.flatnonzero(visible[:t, k]):
             gone = not visible[t, k] or np.linalg.norm(places[s] - places[t]) > 0.5 * reach
             if gone and np.linalg.norm(places[s] - middle) < reach:

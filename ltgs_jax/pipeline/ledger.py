@@ -39,9 +39,11 @@ def make_ledger(
         without = _without(chronology, accounts[t] if t < len(accounts) else (), t)
         if not seen or not without:
             continue
-        whole = squared_error(chronology, t, seen, eye)
+        whole = squared_error(drop_hidden(composed(chronology, t)), seen, eye)
         for what, numbers, other in without:
-            gain = 10 * np.log10(max(squared_error(other, t, seen, eye), 1e-12) / max(whole, 1e-12))
+            gain = 10 * np.log10(
+                max(squared_error(drop_hidden(composed(other, t)), seen, eye), 1e-12) / max(whole, 1e-12)
+            )
             rows.append(
                 {
                     "visit": names[t],
@@ -100,9 +102,8 @@ def _numbers(splats: Splats, count: int) -> int:
     return count * sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(splats))
 
 
-def squared_error(chronology: Chronology, t: int, views: Sequence[VisitView], eye: Eye) -> float:
-    """Mean squared error of the scene of visit t over photographs of it."""
-    scene = drop_hidden(composed(chronology, t))
+def squared_error(scene: Splats, views: Sequence[VisitView], eye: Eye) -> float:
+    """Mean squared error of a scene over photographs of it."""
     total, count = 0.0, 0
     for v in views:
         difference = eye.image(scene, v.view.camera) - np.asarray(v.view.image, np.float32) / 255

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Int
 
@@ -10,7 +9,7 @@ from ltgs_jax.fit import VisitView
 
 from .ledger import squared_error
 from .looks import Eye
-from .state import State, composed, cut_background
+from .state import State, composed, cut_background, cut_template
 
 _PRICE = 2e-3  # growth of the squared error over all later photographs for which the splats that show least may go
 _FEW = 8  # splats that a template must keep
@@ -26,24 +25,36 @@ def drop_idle(state: State, views: Sequence[VisitView], eye: Eye) -> tuple[State
     owner, late = _late_splats(state)
     if not late.any():
         return state, 0
+    visits = {v.visit: [w for w in views if w.visit == v.visit] for v in views}
+    scenes = {t: composed(state.chronology, t) for t in visits}
+    showing = {t: np.asarray(scene.logit_opacities) > -np.inf for t, scene in scenes.items()}
     shown = np.zeros(len(owner))
-    for v in views:
-        splats = composed(state.chronology, v.visit)
-        rows = np.flatnonzero(np.asarray(splats.logit_opacities) > -np.inf)
-        everywhere = np.asarray(v.view.mask, np.float32)[..., None]
-        shown[rows] += eye.votes(splats[rows], v.view.camera, everywhere)[:, 0]
+    for t, seen in visits.items():
+        scene = scenes[t][showing[t]]
+        for v in seen:
+            shown[showing[t]] += eye.votes(scene, v.view.camera, np.asarray(v.view.mask, np.float32)[..., None])[:, 0]
     order = np.flatnonzero(late)[np.argsort(shown[late], kind="stable")]
-    most = (1 + _PRICE) * _error(state, views, eye)
-    kept, low, high = state, 0, len(order) + 1
+
+    def idle(count: int) -> Bool[np.ndarray, " n"]:
+        gone = np.isin(np.arange(len(owner)), order[:count])
+        left = np.bincount(owner[~gone], minlength=1 + len(state.chronology.templates))
+        return gone & ((owner == 0) | (left >= _FEW)[owner])
+
+    def error(gone: Bool[np.ndarray, " n"]) -> float:
+        # By what is left out of scenes of one size: to cut each trial's out would compile for every one.
+        each = [squared_error(scenes[t][showing[t] & ~gone], seen, eye) for t, seen in visits.items()]
+        return float(np.mean(each))
+
+    most, low, high = (1 + _PRICE) * error(idle(0)), 0, len(order) + 1
     # The error grows with the number of those left out: halving finds the most.
     for _ in range(_HALVINGS):
         count = (low + high) // 2
-        trial = _without(state, owner, np.isin(np.arange(len(owner)), order[:count]))
-        if _error(trial, views, eye) <= most:
-            kept, low = trial, count
-        else:
-            high = count
-    return kept, len(owner) - len(_late_splats(kept)[0])
+        low, high = (count, high) if error(idle(count)) <= most else (low, count)
+    gone = idle(low)
+    state = cut_background(state, gone[owner == 0])
+    for k in range(len(state.chronology.templates)):
+        state = cut_template(state, k, gone[owner == k + 1])
+    return state, int(gone.sum())
 
 
 def _late_splats(state: State) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
@@ -52,23 +63,3 @@ def _late_splats(state: State) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, 
     counts = [chronology.background.count, *(m.splats.count for m in chronology.templates)]
     came = [np.full(m.splats.count, m.source_visit > 0) for m in chronology.templates]
     return np.repeat(np.arange(len(counts)), counts), np.concatenate([np.asarray(chronology.since) > 0, *came])
-
-
-def _without(state: State, owner: Int[np.ndarray, " n"], idle: Bool[np.ndarray, " n"]) -> State:
-    state = cut_background(state, idle[owner == 0])
-    for k, template in enumerate(state.chronology.templates):
-        keep = ~idle[owner == k + 1]
-        if keep.sum() < _FEW:
-            continue
-        state = eqx.tree_at(
-            lambda s, k=k: (s.chronology.templates[k].splats, s.template_errors[k]),
-            state,
-            (template.splats[keep], state.template_errors[k][keep]),
-        )
-    return state
-
-
-def _error(state: State, views: Sequence[VisitView], eye: Eye) -> float:
-    """Mean squared error over photographs of later visits, each visit's weighed alike."""
-    visits = sorted({v.visit for v in views})
-    return float(np.mean([squared_error(state.chronology, t, [v for v in views if v.visit == t], eye) for t in visits]))

@@ -11,13 +11,10 @@ from scipy.optimize import linear_sum_assignment
 from ltgs_jax.fit import template_diameter
 from ltgs_jax.geometry import C0
 from ltgs_jax.scene import Splats
-from ltgs_jax.template import middle_of
 
-from .state import Account, State
+from .state import Account, State, middles_of
 
-_APART = (
-    0.5  # distance between the middles of two states, in sizes of the larger, up to which one is in the other's place
-)
+_APART = 0.5  # between the middles of two states, in sizes of the larger, up to which one is in the other's place
 _FACTOR = 2.5  # between the sizes of two states of an object
 _COMMON = 0.6  # share of their colours that two states have in common
 _BINS = 4  # of each channel
@@ -53,9 +50,7 @@ def _in_common(state: State, t: int, old: int, new: int) -> float:
     """Share of colours that two templates have in common; 0 where they differ in place, or much in size."""
     before, after = (state.chronology.templates[k].splats for k in (old, new))
     sizes = template_diameter(before), template_diameter(after)
-    pose = np.asarray(state.chronology.world_from_template[t - 1, old].as_matrix(), np.float64)
-    stood = pose[:3, :3] @ middle_of(np.asarray(before.means, np.float64)) + pose[:3, 3]
-    apart = np.linalg.norm(middle_of(np.asarray(after.means, np.float64)) - stood)
+    apart = np.linalg.norm(middles_of(state, new)[t] - middles_of(state, old)[t - 1])
     if apart > _APART * max(sizes) or max(sizes) > _FACTOR * min(sizes):
         return 0.0
     return float(np.minimum(_histogram(before), _histogram(after)).sum())

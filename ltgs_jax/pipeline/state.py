@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from ltgs_jax.geometry import SE3
 from ltgs_jax.io import arrays_of, module_of
 from ltgs_jax.scene import Chronology, Shadows, Splats, Template, compose, concatenate_splats
-from ltgs_jax.template import Placement, Support
+from ltgs_jax.template import Placement, Support, middle_of
 
 from .looks import on_host
 
@@ -168,10 +168,23 @@ def split_template(state: State, k: int, part: Bool[np.ndarray, " m"], support: 
 def hand_over(state: State, k: int, part: Bool[np.ndarray, " m"], to: int) -> State:
     """A part of template k as more of another, whose frame and poses so far are the same."""
     whole, errors = state.chronology.templates[k].splats, state.template_errors[k]
-    rest = eqx.tree_at(
-        lambda s: (s.chronology.templates[k].splats, s.template_errors[k]), state, (whole[~part], errors[~part])
+    return extend_template(cut_template(state, k, part), to, whole[part], errors[part])
+
+
+def cut_template(state: State, k: int, taken: Bool[np.ndarray, " m"]) -> State:
+    """Template k without some of its splats."""
+    return eqx.tree_at(
+        lambda s: (s.chronology.templates[k].splats, s.template_errors[k]),
+        state,
+        (state.chronology.templates[k].splats[~taken], state.template_errors[k][~taken]),
     )
-    return extend_template(rest, to, whole[part], errors[part])
+
+
+def middles_of(state: State, k: int) -> Float[np.ndarray, "t 3"]:
+    """Where the middle of template k is at its pose of each visit, in world coordinates."""
+    middle = jnp.asarray(middle_of(np.asarray(state.chronology.templates[k].splats.means)), jnp.float32)
+    poses = state.chronology.world_from_template[:, k]
+    return np.asarray(poses.apply(jnp.broadcast_to(middle, (len(state.chronology.visits), 1, 3))))[:, 0]
 
 
 def drop_template(state: State, k: int) -> State:

@@ -107,8 +107,9 @@ def update(
             state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
         key = digest(key, "fit", config.fit.long)
-        chronology = _long_fit(store, key, run, state, eye, progress)
-        _ledger(store, digest(key, "ledger"), run, chronology, accounts, eye, progress)
+        later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
+        chronology = _long_fit(store, key, run, state, later, eye, progress)
+        _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
@@ -221,7 +222,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
     return unpack_state(arrays, notes, run.capture.visits), [Account.from_json(a) for a in notes["accounts"]]
 
 
-def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress) -> Chronology:
+def _long_fit(store: Store, key: str, run: Run, state: State, later, eye: Eye, progress) -> Chronology:
     """Everything together; skipped, and said so, when nothing changed."""
     config = run.config
 
@@ -231,16 +232,15 @@ def _long_fit(store: Store, key: str, run: Run, state: State, eye: Eye, progress
             arrays, notes = pack_state(state)
             return arrays, {**notes, "counts": {"steps": 0}}
         first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-        later = _later_views(run, state.chronology, eye, progress)
         chronology, losses = fit_chronology(
             state.chronology,
-            first + later,
+            first + later(),
             key=jax.random.key(run.seed + 1),
             config=config.fit.long,
             progress=progress.step,
         )
         fitted = eqx.tree_at(lambda s: s.chronology, state, jax.tree.map(np.asarray, chronology))
-        fitted, idle = drop_idle(fitted, later, eye)
+        fitted, idle = drop_idle(fitted, later(), eye)
         arrays, notes = pack_state(fitted)
         return arrays, {**notes, "counts": {"steps": len(losses), "splats_dropped": idle}}
 
@@ -261,11 +261,11 @@ def _later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[V
     return views
 
 
-def _ledger(store: Store, key: str, run: Run, chronology: Chronology, accounts, eye: Eye, progress) -> None:
+def _ledger(store: Store, key: str, chronology: Chronology, accounts, later, eye: Eye, progress) -> None:
     """What each visit added and what that bought, in stages.json."""
 
     def compute():
-        views = _later_views(run, chronology, eye, progress) if chronology.templates else []
+        views = later() if chronology.templates else []
         return {}, {"counts": {"ledger": make_ledger(chronology, accounts, views, eye, progress=progress.step)}}
 
     store.run("ledger", key, compute)

@@ -95,8 +95,7 @@ def with_foot(points: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, " n"]) ->
     """
     low, high = np.quantile(points[part, :2], [0.05, 0.95], axis=0)
     core = part & ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-    middle = points[core, :2].mean(axis=0)
-    below = convex_footprint(_WIDER * (points[core, :2] - middle) + middle, points[:, :2])
+    below = _within_outline(points, np.flatnonzero(core), slice(None), np.eye(3)[:2], wider=_WIDER)
     beside = points[~part & ~below, 2]
     if len(beside) < _FEW:
         return part, float(np.quantile(points[part, 2], 0.02))
@@ -178,10 +177,10 @@ def _islands(
     return islands
 
 
-def _within_outline(means, body, queries, axes) -> Bool[np.ndarray, " q"]:
-    """Which splats lie over the convex outline, a tenth wider, that a body has on its support."""
+def _within_outline(means, body, queries, axes, *, wider: float = 1.1) -> Bool[np.ndarray, " q"]:
+    """Which splats lie over the convex outline, so much wider, that a body has on its support."""
     flat = means[body] @ axes.T
-    return convex_footprint((flat - flat.mean(axis=0)) * 1.1 + flat.mean(axis=0), means[queries] @ axes.T)
+    return convex_footprint((flat - flat.mean(axis=0)) * wider + flat.mean(axis=0), means[queries] @ axes.T)
 
 
 def _parts(
