@@ -155,6 +155,19 @@ def test_a_burden_taken_down_parts_from_what_it_stood_on():
     assert taken_down(points, left, stayed, least=250) is None
 
 
+def test_a_burden_as_wide_as_what_carried_it_is_parted_where_the_evidence_is_clean():
+    points = np.random.default_rng(7).uniform([-0.1, -0.1, 0], [0.1, 0.1, 0.2], (600, 3))
+    burden = points[:, 2] > 0.08
+    left, stayed = np.where(burden, 1.0, 0.05), np.where(burden, 0.05, 1.0)
+    part = taken_down(points, left, stayed, least=20)
+    assert part is not None
+    assert np.mean(part == burden) > 0.9
+    alike = np.random.default_rng(8).uniform(size=600) < 0.2  # colours that agree or not by chance
+    assert taken_down(points, np.where(alike, stayed, left), np.where(alike, left, stayed), least=20) is None
+    foot = points[:, 2] > 0.01  # what left has a seam at the ground that tells nothing
+    assert taken_down(points, np.where(foot, 1.0, 0), np.where(foot, 0, 1.0), least=20) is None
+
+
 def test_random_walk_reaches_the_side_without_evidence():
     rng = np.random.default_rng(1)
     table, (box, colors) = _table(rng), _box(rng)

@@ -8,7 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jax.sharding import Mesh
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ltgs_jax.geometry import SE3
 from ltgs_jax.render import RenderPlan, render
@@ -24,6 +25,7 @@ from ltgs_jax.scene import (
     transform_splats,
 )
 
+from .devices import mean_gradient, mesh_for, stacked
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
 from .shadows import lay_blobs
@@ -38,7 +40,10 @@ class LongConfig:
     """How the chronology is refined (section 3.4 of the LTGS paper), in the parts of photographs that changed."""
 
     passes: int = 16
-    """Adam steps on each window of a later photograph; 0: nothing is refined."""
+    """How often each window of a later photograph is looked at; 0: nothing is refined."""
+    batch: int = 1
+    """Windows that an Adam step looks at, dealt out over as many devices as divide it; its rates go with the square
+    root."""
     replay: float = 0.4
     """Share of the steps spent on photographs of the first visit, against forgetting."""
     window: float = 0.275
@@ -135,8 +140,19 @@ class _Fixed(eqx.Module):
     extent: Float[Array, ""]
 
 
-def _window_splats(variables: _Variables, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
-    """What shows in a window: its variable splats, where and how lit they are at that visit, and the ground's."""
+class _Look(eqx.Module):
+    """What an item of a step's batch looks at: a window, which of the variable splats and of the ground's show in it
+    (padded with their counts), and where among the rows of the whole batch its own lie."""
+
+    window: Window
+    rows: Int[Array, " m"]
+    ground_rows: Int[Array, " g"]
+    place: Int[Array, " m"]
+
+
+def _window_splats(variables: _Variables, look: _Look, fixed: _Fixed) -> Splats:
+    """What shows in a window, of its variable splats, where and how lit they are at that visit, and of the ground's."""
+    rows, visit = look.rows, look.window.visit
     splats, index = variables.splats, fixed.placements.index[visit]
     here = (fixed.placements.poses @ SE3.exp(variables.tangents))[index]
     still = SE3.identity((1,), splats.means.dtype)
@@ -151,9 +167,14 @@ def _window_splats(variables: _Variables, rows, ground_rows, visit, fixed: _Fixe
     lit = shade_splats(splats, gain + jnp.sum(shade[:, 1:] * along, axis=-1))
     moved = transform_splats(here, _hide_padding(lit, rows, fixed.owner.shape[0]), owner)
     ground = (fixed.ground, fixed.ground_since)
-    around, since = jax.tree.map(lambda leaf: leaf.at[ground_rows].get(mode="clip"), ground)
+    around, since = _taken(ground, look.ground_rows)
     around = shade_splats(around, ground_gain(shadows, around.means, since, visit))
-    return concatenate_splats([moved, _hide_padding(around, ground_rows, fixed.ground.count)])
+    return concatenate_splats([moved, _hide_padding(around, look.ground_rows, fixed.ground.count)])
+
+
+def _taken(tree: PyTree, rows: Int[Array, " m"]) -> PyTree:
+    """Rows of every leaf; those beyond its end are its last."""
+    return jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), tree)
 
 
 def _hide_padding(splats: Splats, rows, count: int) -> Splats:
@@ -161,38 +182,39 @@ def _hide_padding(splats: Splats, rows, count: int) -> Splats:
     return eqx.tree_at(lambda s: s.logit_opacities, splats, jnp.where(rows < count, splats.logit_opacities, -jnp.inf))
 
 
-@eqx.filter_jit(donate="all-except-first")
-def _step(inputs, variables: _Variables, state, config: LongConfig, plan: RenderPlan):
-    """One step on one window. `inputs`: what is fixed, window, its rows of the variable splats and of the ground's
-    (padded with counts), progress. Only those rows, and their moments, are touched."""
-    fixed, window, rows, ground_rows, progress = inputs
+def _objective(variables: _Variables, look: _Look, fixed: _Fixed, *, config: LongConfig, plan: RenderPlan):
+    """Loss of a window with the splats of the batch's rows; beside it, what it is without the price of needles, and the
+    overflow."""
+    window, own = look.window, _taken(variables.splats, look.place)
+    out = render(_window_splats(eqx.tree_at(lambda v: v.splats, variables, own), look, fixed), window.camera, plan=plan)
     target = window.image.astype(jnp.float32) / 255
+    loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
+    needle = jax.nn.relu(jnp.ptp(own.log_scales, axis=-1) - jnp.log(8.0))
+    mine = (fixed.owner.at[look.rows].get(mode="clip") > 0) & (look.rows < fixed.owner.shape[0])
+    needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
+    return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
 
-    def taken(tree):
-        return jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), tree)
+
+@eqx.filter_jit(donate="all-except-first")
+def _step(inputs, variables: _Variables, state, config: LongConfig, plan: RenderPlan, mesh: Mesh):
+    """One step on a batch of windows. `inputs`: what is fixed, the batch, its rows of the variable splats, progress.
+    Only those rows, and their moments, are touched."""
+    fixed, looks, rows, progress = inputs
 
     def put(tree, part):
         return jax.tree.map(lambda leaf, new: leaf.at[rows].set(new, mode="drop"), tree, part)
 
-    owner, came = taken((fixed.owner, fixed.came))
-
-    def objective(local: _Variables):
-        splats = _window_splats(local, rows, ground_rows, window.visit, fixed)
-        out = render(splats, window.camera, plan=plan)
-        loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
-        needle = jax.nn.relu(jnp.ptp(local.splats.log_scales, axis=-1) - jnp.log(8.0))
-        mine = (owner > 0) & (rows < fixed.owner.shape[0])
-        needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
-        return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
-
-    local = eqx.tree_at(lambda v: v.splats, variables, taken(variables.splats))
-    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(local)
+    came = fixed.came.at[rows].get(mode="clip")
+    local = eqx.tree_at(lambda v: v.splats, variables, _taken(variables.splats, rows))
+    objective = partial(_objective, config=config, plan=plan)
+    gradient, loss, overflow = mean_gradient(objective, local, looks, fixed, mesh)
     # What a window hardly shows of a shadow is held to nothing.
     leaning = jnp.where(gradient.shadows != 0, gradient.shadows + _PRICE * variables.shadows, 0)
     gradient = eqx.tree_at(lambda g: g.shadows, gradient, leaning)
-    rows_of = partial(eqx.tree_at, lambda v: v.splats, replace_fn=taken)
+    rows_of = partial(eqx.tree_at, lambda v: v.splats, replace_fn=lambda splats: _taken(splats, rows))
     before = state._replace(mu=rows_of(state.mu), nu=rows_of(state.nu))
     updates, after = adam().update(gradient, before)
+    updates = jax.tree.map(lambda leaf: config.batch**0.5 * leaf, updates)
     moves = scale_gradients(updates.splats, config.rates, fixed.extent, progress)
     colours = jnp.where(came, 1, config.background_rate)[:, None, None] * moves.sh
     moves = jax.tree.map(lambda leaf: jnp.where(came.reshape((-1,) + (1,) * (leaf.ndim - 1)), leaf, 0), moves)
@@ -335,68 +357,81 @@ def _rows_among(rows: Int[np.ndarray, " m"], chosen: Int[np.ndarray, " n"]) -> I
 def _fit_windows(
     variables: _Variables, fixed: _Fixed, windows: Sequence[Window], rows, *, key, config: LongConfig, progress
 ) -> tuple[_Variables, Float[np.ndarray, " s"]]:
-    """The steps, each on one window drawn at random."""
+    """The steps, each on windows drawn at random."""
     later = [i for i, w in enumerate(windows) if w.visit > 0]
     first = [i for i, w in enumerate(windows) if w.visit == 0]
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     replayed = config.replay if first else 0.0
-    steps = round(config.passes * len(later) / max(1 - replayed, 0.1))
+    mesh = mesh_for(config.batch)
+    steps = round(config.passes * len(later) / max(1 - replayed, 0.1) / config.batch)
     losses = np.zeros(steps, np.float32)
     if steps == 0:
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
         return variables, losses
-    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first")
-    counts, most = (fixed.owner.shape[0], fixed.ground.count), _most(rows)
-    rows = [tuple(map(_padded, pair, most, counts)) for pair in rows]
-    # A window's visit is traced, so that one program serves all.
-    windows = [eqx.tree_at(lambda w: (w.visit, w.rows), w, (jnp.asarray(w.visit), None)) for w in windows]
-
-    def plan(variables: _Variables) -> RenderPlan:
-        return plan_for(
-            [(_shown(variables, *pair, w.visit, fixed), w.camera) for w, pair in zip(windows, rows, strict=True)],
-            slack=1.4,
-        )
-
+    dealt = "" if config.batch == 1 else f"; {config.batch} a step, on {mesh.size} of {jax.device_count()} devices"
+    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first{dealt}")
+    looks, plan_of = _looks(windows, rows, fixed), partial(_plan, fixed=fixed)
     state = adam().init(variables)
     queues: dict[bool, list[int]] = {True: [], False: []}
-    held = plan(variables)
-    finite = kept = jax.tree.map(np.array, variables)
-    for step in range(steps):
-        if step % 100 == 0:
-            finite, kept = kept, jax.tree.map(np.array, variables)
+
+    def draw() -> _Look:
         replay = rng.random() < replayed
         queue = queues[replay]
         if not queue:
             queue.extend(rng.permutation(first if replay else later).tolist())
-        i = queue.pop()
-        inputs = (fixed, windows[i], *rows[i], jnp.asarray(step / steps, jnp.float32))
-        variables, state, loss, overflow = _step(inputs, variables, state, config, held)
+        return looks[queue.pop()]
+
+    held = plan_of(variables, looks)
+    finite = kept = jax.tree.map(np.array, variables)
+    for step in range(steps):
+        if step % 100 == 0:
+            finite, kept = kept, jax.tree.map(np.array, variables)
+        batch, united = _united([draw() for _ in range(config.batch)], fixed.owner.shape[0])
+        inputs = (fixed, batch, united, jnp.asarray(step / steps, jnp.float32))
+        variables, state, loss, overflow = _step(inputs, variables, state, config, held, mesh)
         losses[step] = loss
         if not np.isfinite(losses[step]):
             progress(step, steps, "the loss is not finite: stopped at the last good state")
             return finite, losses[:step]
         if int(overflow) > 0:
-            held = plan(variables)
+            held = plan_of(variables, looks)
         if step % 100 == 0 or step == steps - 1:
             progress(step + 1, steps, f"loss {losses[max(0, step - 100) : step + 1].mean():.4f}")
     return variables, losses
 
 
+def _looks(windows: Sequence[Window], rows, fixed: _Fixed) -> list[_Look]:
+    """Each window by itself, on the host, all of one shape and its visit traced, so that one program serves all."""
+    counts = (fixed.owner.shape[0], fixed.ground.count)
+    lengths = [max(256, -(-max(len(pair[kind]) for pair in rows) // 256) * 256) for kind in (0, 1)]
+    looks = []
+    for window, pair in zip(windows, rows, strict=True):
+        own, ground = (_padded(r, length, count) for r, length, count in zip(pair, lengths, counts, strict=True))
+        window = eqx.tree_at(lambda w: (w.visit, w.rows), window, (np.asarray(window.visit), None))
+        looks.append(_Look(jax.tree.map(np.asarray, window), own, ground, np.arange(len(own), dtype=np.int32)))
+    return looks
+
+
+def _united(looks: Sequence[_Look], count: int) -> tuple[_Look, Int[np.ndarray, " r"]]:
+    """Looks as a batch, and the rows of the variable splats that show in any of them, padded with `count`."""
+    rows = np.unique(np.concatenate([look.rows for look in looks]))
+    rows = _padded(rows[rows < count], sum(len(look.rows) for look in looks), count)
+    placed = [eqx.tree_at(lambda x: x.place, look, np.searchsorted(rows, look.rows).astype(np.int32)) for look in looks]
+    return stacked(placed), rows
+
+
+def _plan(variables: _Variables, looks: Sequence[_Look], fixed: _Fixed) -> RenderPlan:
+    return plan_for([(_shown(variables, look, fixed), look.window.camera) for look in looks], slack=1.4)
+
+
 @eqx.filter_jit
-def _shown(variables: _Variables, rows, ground_rows, visit, fixed: _Fixed) -> Splats:
-    own = jax.tree.map(lambda leaf: leaf.at[rows].get(mode="clip"), variables.splats)
-    return _window_splats(eqx.tree_at(lambda v: v.splats, variables, own), rows, ground_rows, visit, fixed)
+def _shown(variables: _Variables, look: _Look, fixed: _Fixed) -> Splats:
+    return _window_splats(eqx.tree_at(lambda v: v.splats, variables, _taken(variables.splats, look.rows)), look, fixed)
 
 
-def _most(rows) -> tuple[int, int]:
-    """The most rows of either kind in any window."""
-    return tuple(max(len(pair[kind]) for pair in rows) for kind in (0, 1))
-
-
-def _padded(rows: Int[np.ndarray, " m"], most: int, count: int) -> Int[Array, " n"]:
-    """Rows up to a multiple of 256, with `count`, which names none."""
-    length = max(256, -(-most // 256) * 256)
-    return jnp.asarray(np.pad(rows, (0, length - len(rows)), constant_values=count), jnp.int32)
+def _padded(rows: Int[np.ndarray, " m"], length: int, count: int) -> Int[np.ndarray, " n"]:
+    """Rows up to a length, with `count`, which names none."""
+    return np.pad(rows, (0, length - len(rows)), constant_values=count).astype(np.int32)
 
 
 _SHOWN = -2.2  # logit of the opacity from which on a splat counts for the size, 0.1

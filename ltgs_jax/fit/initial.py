@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 from scipy.spatial import cKDTree
 
@@ -14,6 +16,7 @@ from ltgs_jax.geometry import C0, Camera
 from ltgs_jax.render import RenderPlan, render, splat_votes
 from ltgs_jax.scene import Splats
 
+from .devices import mean_gradient, mesh_for, stacked
 from .growth import faint, recycle
 from .loss import photometric_loss
 from .optimizer import Rates, adam, reset_moments, scale_gradients
@@ -25,6 +28,10 @@ class InitialConfig:
     """How the initial scene is fitted."""
 
     steps: int = 800
+    """Photographs that are looked at, one after another."""
+    batch: int = 1
+    """Of these, how many an Adam step looks at, dealt out over as many devices as divide it; its rates go with the
+    square root."""
     max_splats: int = 30_000
     sh_degree: int = 1
     dssim: float = 0.2
@@ -77,19 +84,20 @@ def splats_from_points(
     )
 
 
+def _objective(splats: Splats, item, _, *, config: InitialConfig, plan: RenderPlan):
+    camera, image, mask = item
+    out = render(splats, camera, plan=plan)
+    loss = photometric_loss(out.image, image.astype(splats.means.dtype) / 255, mask, dssim=config.dssim)
+    return loss + config.opacity_penalty * jnp.mean(splats.opacities), (loss, out.overflow)
+
+
 @eqx.filter_jit(donate="all-except-first")
-def _step(inputs, splats: Splats, state, config: InitialConfig, plan: RenderPlan):
-    """One Adam step on one photograph. `inputs`: camera, image, mask, extent, progress."""
-    camera, image, mask, extent, progress = inputs
-    target = image.astype(splats.means.dtype) / 255
-
-    def objective(splats):
-        out = render(splats, camera, plan=plan)
-        loss = photometric_loss(out.image, target, mask, dssim=config.dssim)
-        return loss + config.opacity_penalty * jnp.mean(splats.opacities), (loss, out.overflow)
-
-    gradient, (loss, overflow) = jax.grad(objective, has_aux=True)(splats)
+def _step(inputs, splats: Splats, state, config: InitialConfig, plan: RenderPlan, mesh: Mesh):
+    """One Adam step on a batch of photographs. `inputs`: cameras, images and masks, extent, progress."""
+    batch, extent, progress = inputs
+    gradient, loss, overflow = mean_gradient(partial(_objective, config=config, plan=plan), splats, batch, None, mesh)
     updates, state = adam().update(gradient, state)
+    updates = jax.tree.map(lambda leaf: config.batch**0.5 * leaf, updates)
     steps = scale_gradients(updates, config.rates, extent, progress)
     return eqx.apply_updates(splats, steps), state, loss, overflow
 
@@ -112,6 +120,19 @@ def _plans(splats: Splats, views: Sequence[View | StreamedView]) -> dict[tuple[i
     sizes = sorted({size_of(view) for view in views})
     # Roomy, since every new plan is a new compilation: splats shrink while they are fitted, but their number grows.
     return {size: plan_for([(splats, v.camera) for v in views if size_of(v) == size], slack=4) for size in sizes}
+
+
+def _draw(order: list[int], sizes: Sequence[tuple[int, int]], batch: int, rng: np.random.Generator) -> list[int]:
+    """Indices of a batch of one size from the end of `order`, which is filled anew where it has too few."""
+    drawn: list[int] = []
+    while len(drawn) < batch:
+        size = sizes[drawn[0]] if drawn else None
+        fitting = [at for at, i in enumerate(order) if size in (None, sizes[i])]
+        if fitting:
+            drawn.append(order.pop(fitting[-1]))
+        else:
+            order[:0] = rng.permutation(len(sizes)).tolist()
+    return drawn
 
 
 def fit_initial(
@@ -139,28 +160,32 @@ def fit_initial(
     splats = jax.tree.map(jnp.copy, splats)  # the steps donate their buffers, and the caller's are not ours
     state = adam().init(splats)
     losses = np.zeros(config.steps, np.float32)
-    current, plans, order = halved(views), {}, []
-    if coarse_steps == 0:
-        current = list(views)
-    for step in range(config.steps):
-        if step == coarse_steps:
+    coarse, mesh = coarse_steps > 0, mesh_for(config.batch)
+    current, plans, order = halved(views) if coarse else list(views), {}, []
+    if config.batch > 1:
+        text = f"{config.batch} photographs a step, on {mesh.size} of {jax.device_count()} devices"
+        progress(0, config.steps, text)
+    for step in range(0, config.steps, config.batch):
+        if coarse and step >= coarse_steps:
+            coarse = False
             current, plans = list(views), {}
         if not plans:
             plans = _plans(splats, current)
-        if step % config.grow_every == 0 and 0 < step <= grow_until:
+        if step % config.grow_every < config.batch <= step <= grow_until:
             sample = [current[i] for i in rng.permutation(len(views))[:8]]
             scores = _error_scores(splats, sample, plans)
             splats, replaced = recycle(splats, scores, jnp.asarray(int((growth - 1) * alive) + 1))
             state = reset_moments(state, replaced)
             alive = int(jnp.sum(~faint(splats)))
-        order = order or rng.permutation(len(views)).tolist()
-        view = current[order.pop()]
-        inputs = (view.camera, view.image, view.mask, extent, jnp.asarray(step / config.steps, splats.means.dtype))
-        splats, state, loss, overflow = _step(inputs, splats, state, config, plans[size_of(view)])
-        losses[step] = loss
+        drawn = [current[i] for i in _draw(order, [size_of(view) for view in views], config.batch, rng)]
+        batch = stacked([jax.tree.map(np.asarray, (view.camera, view.image, view.mask)) for view in drawn])
+        inputs = (batch, extent, jnp.asarray(step / config.steps, splats.means.dtype))
+        splats, state, loss, overflow = _step(inputs, splats, state, config, plans[size_of(drawn[0])], mesh)
+        losses[step : step + config.batch] = loss
         if int(overflow) > 0:
             plans = _plans(splats, current)
-        if step % 50 == 0 or step == config.steps - 1:
-            mean = losses[max(0, step - len(views)) : step + 1].mean()
-            progress(step + 1, config.steps, f"loss {mean:.4f}, {alive} splats")
+        seen = min(step + config.batch, config.steps)
+        if step % 50 < config.batch or seen == config.steps:
+            mean = losses[max(0, seen - 1 - len(views)) : seen].mean()
+            progress(seen, config.steps, f"loss {mean:.4f}, {alive} splats")
     return FitResult(splats[~faint(splats)], losses)

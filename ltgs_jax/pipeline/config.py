@@ -81,7 +81,9 @@ _LEAST = {
     "io.max_side": 16,
     "fit.initial.max_splats": 4,
     "fit.initial.steps": 1,
+    "fit.initial.batch": 1,
     "fit.initial.grow_every": 1,
+    "fit.long.batch": 1,
 }
 _MOST = {"fit.initial.sh_degree": 3}
 

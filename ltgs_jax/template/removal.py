@@ -17,6 +17,7 @@ _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
 _WIDER = 1.2  # by which the outline of the middle 90 % is widened to be that of the whole
 _FEW = 20  # splats beside what was taken down that tell how high the rest is
+_CLEAN = 0.1  # share of the evidence that speaks against a level, up to which it needs no step there
 _STEP = 1.5  # growth of an outline from which on one thing stands upon another
 
 
@@ -58,7 +59,8 @@ def taken_down(
     config: TemplateConfig = TemplateConfig(),
 ) -> Bool[np.ndarray, " n"] | None:
     """The splats of what was taken down from upon the rest; None where the evidence does not part at a level, where the
-    outline does not step there, or where either side has less than `least` pixels of evidence.
+    outline does not step there unless hardly any evidence speaks against the level, or where either side has less than
+    `least` pixels of evidence.
 
     `points`: their centres along two axes of the support and its normal. The level is the one at which the outline
     grows most, of those that part the evidence and those below: the foot of what was taken down tells little.
@@ -66,11 +68,10 @@ def taken_down(
     height = points[:, 2]
     levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
 
-    def parts(level: float) -> bool:
+    def parts(level: float, off: float = _OFF, low: float = config.whole, least: float = least) -> bool:
         upper = height > level
         told = left[upper].sum() > least and stayed[~upper].sum() > least
-        off, low = share_of(left[upper], stayed[upper]), share_of(left[~upper], stayed[~upper])
-        return told and off > _OFF and low < config.whole
+        return told and share_of(left[upper], stayed[upper]) > off and share_of(left[~upper], stayed[~upper]) < low
 
     net = left - stayed
     best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
@@ -84,7 +85,10 @@ def taken_down(
         for level in levels
     ]
     step = int(np.argmax(growth))
-    return height > levels[step] if growth[step] > _STEP else None
+    if growth[step] > _STEP:
+        return height > levels[step]
+    clean = parts(levels[best], off=1 - _CLEAN, low=_CLEAN, least=_CLEAN * (left + stayed).sum())
+    return height > levels[best] if clean else None
 
 
 def with_foot(points: Float[np.ndarray, "n 3"], part: Bool[np.ndarray, " n"]) -> tuple[Bool[np.ndarray, " n"], float]:
