@@ -5,10 +5,12 @@ import json
 import os
 import struct
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from ltgs_jax import io
 from ltgs_jax.geometry import SE3
@@ -50,6 +52,27 @@ def assert_same(a: Chronology, b: Chronology) -> None:
     for left, right in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         assert left.dtype == right.dtype
         np.testing.assert_array_equal(left, right)
+
+
+@pytest.mark.parametrize("precision, bound, bytes_of_splat", [("half", 2**-11, 12 + 2 * 20), ("8-bit", 0, 12 + 20)])
+def test_a_smaller_file_is_as_near_as_its_precision_allows(tmp_path, precision, bound, bytes_of_splat):
+    chronology = make_chronology()
+    io.save_chronology(tmp_path, chronology, precision=precision)
+    read = io.load_chronology(tmp_path)
+    before, after = chronology.background, read.background
+    np.testing.assert_array_equal(after.means, before.means)
+    for name in ("quats", "log_scales", "logit_opacities", "sh"):
+        a, b = np.asarray(getattr(before, name)), np.asarray(getattr(after, name))
+        assert b.dtype == np.float32
+        assert (np.abs(b - a) <= bound * np.abs(a) + (0 if bound else np.ptp(a, axis=0) / 500)).all()
+        assert (a != b).any()
+    rest = eqx.tree_at(lambda c: (c.background, c.templates), read, (chronology.background, chronology.templates))
+    assert_same(chronology, rest)
+    arrays = safetensors.numpy.load((tmp_path / "chronology.safetensors").read_bytes())
+    stored = [a.nbytes for key, a in arrays.items() if key.startswith("background.") and not key.endswith("range")]
+    assert sum(stored) == 11 * (bytes_of_splat + 4)  # and since when each shows
+    with pytest.raises(ValueError, match="precision: expected one of full, half, 8-bit"):
+        io.save_chronology(tmp_path, chronology, precision="4-bit")
 
 
 @pytest.mark.parametrize("templates", [0, 1, 4])

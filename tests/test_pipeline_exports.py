@@ -4,6 +4,7 @@ import json
 import struct
 from pathlib import Path
 
+import cv2
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -35,6 +36,7 @@ def finished(tmp_path_factory) -> tuple[Path, Path]:
     save_chronology(folder / "out", chronology)
     rows = {p.name: {"visit": p.visit, "role": p.role, **_camera_json(p.camera)} for p in capture.photographs}
     write_json(folder / "out" / "cameras.json", {"capture": str(folder / "capture"), "photographs": rows})
+    write_json(folder / "out" / "tracks.json", {"version": 1, "visits": list(chronology.visits), "objects": []})
     return folder / "out", folder / "capture"
 
 
@@ -48,6 +50,24 @@ def test_a_visit_as_splats(finished, tmp_path, form, tolerance):
         assert found.count == meant.count == (1556 if visit == 1 else 1296)
         by_place = [np.sort(np.asarray(s.means), axis=0) for s in (found, meant)]  # a compressed PLY may reorder
         np.testing.assert_allclose(*by_place, atol=tolerance)
+
+
+@pytest.mark.parametrize("form, tolerance, size", [("chronology-half", 4e-3, 0.7), ("chronology-8bit", 0.05, 0.5)])
+def test_all_visits_in_a_smaller_file(finished, tmp_path, form, tolerance, size):
+    out, _ = finished
+    pipeline.export(out, form, tmp_path / "small")
+    whole, small = ((folder / "chronology.safetensors").stat().st_size for folder in (out, tmp_path / "small"))
+    assert small < size * whole
+    name = next(iter(json.loads((out / "cameras.json").read_text())["photographs"]))
+    for visit in (0, 1, 2):
+        images = []
+        for folder in (out, tmp_path / "small"):
+            pipeline.render_visit(folder, visit, name, False, tmp_path / "images")
+            images.append(cv2.imread(str((tmp_path / "images" / name).with_suffix(".png"))) / 255)
+        assert images[0].std() > 0.02
+        assert np.abs(images[0] - images[1]).max() <= tolerance + 1 / 255
+    with pytest.raises(InputError, match="is the run's own folder"):
+        pipeline.export(out, form, out)
 
 
 def test_a_sequence_that_players_find(finished, tmp_path):

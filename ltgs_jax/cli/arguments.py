@@ -105,10 +105,13 @@ class Export:
     folder: Positional[Path]
     """Folder of the chronology."""
     out: Path
-    """The file; a folder for ply-sequence and colmap."""
-    format: Literal["ply", "compressed-ply", "spz", "splat", "ply-sequence", "gltf", "colmap"] = "ply"
+    """The file; a folder for ply-sequence, colmap and the chronologies."""
+    format: Literal[
+        "ply", "compressed-ply", "spz", "splat", "ply-sequence", "gltf", "colmap", "chronology-half", "chronology-8bit"
+    ] = "ply"
     """ply, compressed-ply (SuperSplat), spz (Niantic), splat: one visit. ply-sequence: every visit, numbered, as
-    SuperSplat plays them; gltf: the objects' poses as an animation (.glb); colmap: the cameras of all photographs."""
+    SuperSplat plays them; gltf: the objects' poses as an animation (.glb); colmap: the cameras of all photographs;
+    chronology-half, chronology-8bit: all visits in one file of half the size or a third, to render and export from."""
     visit: str | None = None
     """Name of a visit, or its number from 0; not for the formats that hold all of them."""
     capture: Path | None = None

@@ -22,6 +22,9 @@ M = TypeVar("M", bound=eqx.Module)
 
 _VERSION = 1
 _DTYPES = ("float32", "float64")
+PRECISIONS = ("full", "half", "8-bit")
+"""How the splats of a chronology are stored, but for their centres: as they are, in half precision, or each component
+in 256 steps over its range."""
 
 
 def _keys(name: str, kind: type[eqx.Module]) -> list[str]:
@@ -39,12 +42,14 @@ def module_of(kind: type[M], name: str, arrays: Mapping[str, np.ndarray]) -> M:
     return kind(*(arrays[key] for key in _keys(name, kind)))
 
 
-def save_chronology(folder: str | Path, chronology: Chronology) -> None:
-    """Write `chronology.safetensors` and its description `chronology.json`, each in one step.
+def save_chronology(folder: str | Path, chronology: Chronology, *, precision: str = "full") -> None:
+    """Write `chronology.safetensors` and its description `chronology.json`, each in one step, in one of `PRECISIONS`.
 
     The arrays file carries the description too, so that whichever moment a run is stopped at, it is whole by itself.
-    Raises InputError when the folder cannot be written.
+    Raises InputError when the folder cannot be written, ValueError for another precision.
     """
+    if precision not in PRECISIONS:
+        raise ValueError(f"precision: expected one of {', '.join(PRECISIONS)}, got {precision}")
     folder = Path(folder)
     arrays = {
         "world_from_template.quat": chronology.world_from_template.quat,
@@ -61,7 +66,10 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
-        arrays |= arrays_of(name, splats)
+        means, *others = arrays_of(name, splats).items()
+        arrays |= dict([means])
+        for key, array in others:
+            arrays |= _stored(key, array, precision)
     description = {
         "version": _VERSION,
         "visits": list(chronology.visits),
@@ -78,8 +86,20 @@ def save_chronology(folder: str | Path, chronology: Chronology) -> None:
     write_json(folder / "chronology.json", description)
 
 
+def _stored(key: str, array: np.ndarray, precision: str) -> dict[str, np.ndarray]:
+    """An array of splats [n …] as it is stored."""
+    if precision == "full":
+        return {key: array}
+    if precision == "half":
+        return {key: array.astype(np.float16)}
+    low, high = (pick(array, axis=0) if len(array) else np.zeros(array.shape[1:]) for pick in (np.min, np.max))
+    step = np.where(high > low, (high - low) / 255, 1)
+    return {key: np.rint((array - low) / step).astype(np.uint8), f"{key}.range": np.stack([low, high]).astype("f4")}
+
+
 def load_chronology(folder: str | Path) -> Chronology:
-    """The chronology that `save_chronology` wrote, bit for bit, in the dtypes that it had.
+    """The chronology that `save_chronology` wrote: bit for bit, in the dtypes that it had, or what is nearest to it, in
+    float32, where it was stored in less than full precision.
 
     Raises InputError that names the file when it is missing, cut short, or does not fit together.
     """
@@ -179,7 +199,15 @@ class _Taker:
         if k and math.isqrt(k[0]) ** 2 != k[0]:
             raise InputError(f"{self._path}: {name}.sh has {k[0]} coefficients")
         shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *k, 3))
-        return Splats(*(self(key, shape) for key, shape in zip(_keys(name, Splats), shapes, strict=True)))
+        return Splats(*(self._restored(key, shape) for key, shape in zip(_keys(name, Splats), shapes, strict=True)))
+
+    def _restored(self, key: str, shape: tuple[int, ...]):
+        """What `_stored` stored."""
+        array = self(key, shape, dtypes=(*_DTYPES, "float16", "uint8"))
+        if array.dtype == jnp.uint8:
+            low, high = self(f"{key}.range", (2, *shape[1:]), dtypes=("float32",))
+            return low + array * ((high - low) / 255)
+        return array.astype(jnp.float32) if array.dtype == jnp.float16 else array
 
     def shadows(self, t: int) -> Shadows:
         """The shadows of t visits."""

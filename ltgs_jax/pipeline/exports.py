@@ -9,7 +9,10 @@ from ltgs_jax.io import (
     InputError,
     export_colmap,
     load_chronology,
+    read_bytes,
     read_capture,
+    save_chronology,
+    write_bytes,
     write_gltf,
     write_ply,
     write_splats,
@@ -18,8 +21,11 @@ from ltgs_jax.scene import compose, drop_hidden
 
 from .outputs import read_cameras
 
-WHOLE_FORMATS = ("ply-sequence", "gltf", "colmap")
-"""Formats that hold every visit: a folder of numbered PLYs, the objects' poses as an animation, a COLMAP model."""
+SMALL_FORMATS = {"chronology-half": "half", "chronology-8bit": "8-bit"}
+"""Chronologies in less than full precision: a folder that is rendered, exported and read as the run's own."""
+WHOLE_FORMATS = ("ply-sequence", "gltf", "colmap", *SMALL_FORMATS)
+"""Formats that hold every visit: a folder of numbered PLYs, the objects' poses as an animation, a COLMAP model, and
+chronologies."""
 FORMATS = (*SPLAT_FORMATS, *WHOLE_FORMATS)
 
 
@@ -28,8 +34,9 @@ def export(
 ) -> None:
     """Write a chronology's visit (SPLAT_FORMATS) or the whole of it (WHOLE_FORMATS) as `form`.
 
-    `out` is a file, or a folder for `ply-sequence` and `colmap`. `colmap` takes photographs and points from `capture`
-    (None: from where the capture was when the run was made). Raises InputError that names the option or the file.
+    `out` is a file, or a folder for `ply-sequence`, `colmap` and the chronologies. `colmap` takes photographs and
+    points from `capture` (None: from where the capture was when the run was made). Raises InputError that names the
+    option or the file.
     """
     folder, out = Path(folder), Path(out)
     if form not in FORMATS:
@@ -48,6 +55,12 @@ def export(
         if out.suffix.lower() != ".glb":
             raise InputError(f"--out {out}: glTF is written in its binary form; name a .glb file")
         write_gltf(out, load_chronology(folder))
+    elif form in SMALL_FORMATS:
+        if out.resolve() == folder.resolve():
+            raise InputError(f"--out {out}: is the run's own folder; its chronology would be lost")
+        save_chronology(out, load_chronology(folder), precision=SMALL_FORMATS[form])
+        for name in ("tracks.json", "cameras.json"):
+            write_bytes(out / name, read_bytes(folder / name))
     else:
         _export_cameras(folder, out, capture)
 
