@@ -1,6 +1,7 @@
 """What the scene's renderer may get wrong, to test what that does to a run."""
 
 import zlib
+from collections.abc import Sequence
 
 import cv2
 import equinox as eqx
@@ -11,6 +12,22 @@ from ltgs_jax.pipeline.looks import Eye, Look
 from ltgs_jax.scene import Splats
 
 _PATCH_PX = 16
+
+
+class Blind(Eye):
+    """The renderer, which expects nothing to look as it shows it in some cameras: their change masks are empty."""
+
+    def __init__(self, cameras: Sequence[Camera]) -> None:
+        super().__init__()
+        self._poses = [np.asarray(camera.cam_from_world.as_matrix()) for camera in cameras]
+
+    def look(self, splats: Splats, camera: Camera, errors: np.ndarray) -> Look:
+        """As `Eye.look`, with other expectations in these cameras."""
+        look = super().look(splats, camera, errors)
+        pose = np.asarray(camera.cam_from_world.as_matrix())
+        if any(np.allclose(pose, other, atol=1e-4) for other in self._poses):
+            look = eqx.tree_at(lambda each: each.expected, look, np.full_like(look.expected, np.inf))
+        return look
 
 
 class NoisyDepth(Eye):

@@ -43,6 +43,7 @@ class Column:
 COLUMNS = (
     Column("PSNR changed", "psnr_changed", better=1),
     Column("PSNR full", "psnr_full", better=1),
+    Column("PSNR static", "psnr_static", better=1),
     Column("SSIM changed", "ssim_changed", 3, better=1),
     Column("SSIM full", "ssim_full", 3, better=1),
     Column("FLIP changed", "flip_changed", 3, better=-1),

@@ -185,9 +185,9 @@ def per_visit_answer(scenes: list[Splats], kept: int | None = None, said: dict[s
 
 
 def score(problem: Problem, answer: Answer, folder: Path) -> dict[str, float]:
-    """The columns of a row: PSNR, SSIM, FLIP, full and changed, pooled over later visits and per visit (`@visit`).
+    """The columns of a row: PSNR, SSIM, FLIP, full, changed and static, pooled over later visits and per visit.
 
-    Leaves one render per visit in folder/renders. `@0` tells what is forgotten of the first visit.
+    Leaves one render per visit in folder/renders. `@t` is of visit t; `@0` tells what is forgotten of the first visit.
     """
     pooled: dict[str, list[float]] = {}
     times: list[float] = []
@@ -203,6 +203,7 @@ def score(problem: Problem, answer: Answer, folder: Path) -> dict[str, float]:
             regions = {"full": held.view.mask}
             if held.changed is not None and t > 0:
                 regions["changed"] = held.view.mask & held.changed
+                regions["static"] = held.view.mask & ~held.changed
             for region, mask in regions.items():
                 if not mask.any():
                     continue

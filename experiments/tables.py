@@ -191,6 +191,11 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
     features = grid(_SYSTEM, base, feature_noise=(0.0, 1.0))
     depths = grid(_SYSTEM, base, depth_noise=(0.0, 0.1))
+    mistakes = {
+        "as it is": base,
+        "no mask in one photograph of each visit": dataclasses.replace(base, missing_masks=True),
+        "one object not known again": dataclasses.replace(base, forgotten=True),
+    }
     own = {"as it is": preset.system, "full": preset.system}
     hyper = {"as it is": QUICK} | {
         f"{name} {value}": (*QUICK, (name, value)) for name, values in HYPERPARAMETERS.items() for value in values
@@ -204,6 +209,7 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
         Sheet("poses", "variants", {f"{r.options.scene.capture.pose_noise}° on given poses": [r] for r in poses}),
         Sheet("features", "variants", {f"{r.options.feature_noise} of a descriptor's norm": [r] for r in features}),
         Sheet("depths", "variants", {f"{r.options.depth_noise:.0%} of the depth": [r] for r in depths}),
+        Sheet("mistakes", "variants", {name: [Run(_SYSTEM, config)] for name, config in mistakes.items()}, own),
         Sheet("hyperparameters", "variants", _variants(preset, scene, hyper), own),
         Sheet("passes", "variants", _variants(preset, scene, PASSES), own),
         Sheet("presets", "variants", _whole(preset, scene), {preset.system: "this page"}),

@@ -13,14 +13,18 @@ alone; the seconds in the row are those that the stages took when they ran.
 
 import json
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from statistics import mean
+
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from experiments.engine import vary
-from experiments.eyes import NoisyDepth
+from experiments.eyes import Blind, NoisyDepth
 from experiments.front_ends import Noisy
 from experiments.scenes import SceneConfig, bytes_of, initial_scene, load_problem, per_visit_answer, score
-from ltgs_jax.io import load_chronology
+from ltgs_jax.io import load_chronology, read_tracks
 from ltgs_jax.pipeline import PRESETS, update
 from ltgs_jax.scene import compose, drop_hidden
 
@@ -40,6 +44,11 @@ class SystemConfig:
     """Standard deviation of noise on every dense descriptor, relative to its norm."""
     depth_noise: float = 0.0
     """Standard deviation of smooth noise on rendered depths, relative to them."""
+    missing_masks: bool = False
+    """Whether the first photograph of each later visit says nothing of change."""
+    forgotten: bool = False
+    """Whether the first object that a visit after the first change finds again is not known then: it gets a second
+    identity."""
     seed: int = 0
 
     @property
@@ -69,11 +78,17 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
         options = vary(options, path, value)
     out = folder / "chronology"
     kept = cache / "stages" / f"{problem.folder.name}_{config.preset}_{config.seed}_{initial_path.parent.name}"
-    undisturbed = config.feature_noise == config.depth_noise == 0
+    undisturbed = config.feature_noise == config.depth_noise == 0 and not (config.missing_masks or config.forgotten)
+    if config.forgotten and not kept.is_dir():
+        run(replace(config, forgotten=False, overrides=()), folder / "plain", cache)
+    if config.forgotten and not out.exists():
+        shutil.copytree(kept, out / "stages")
+        forget_one(out / "stages")
     if kept.is_dir() and not out.exists() and undisturbed:
         shutil.copytree(kept, out / "stages")
     noise = {"front_end": Noisy(sigma=config.feature_noise)} if config.feature_noise > 0 else {}
     noise |= {"eye": NoisyDepth(config.depth_noise)} if config.depth_noise > 0 else {}
+    noise |= {"eye": Blind([problem.update[t][0].camera for t in problem.later])} if config.missing_masks else {}
     chronology = update(
         problem.folder, out, config=options, initial=initial_path, seed=config.seed, progress=Silent(), **noise
     )
@@ -84,12 +99,40 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     loaded = load_chronology(out)
     said |= {"templates": len(chronology.templates), "splats": sum(t.splats.count for t in chronology.templates)}
     said["splats"] += chronology.background.count
+    events = [s for each in read_tracks(out / "tracks.json")["objects"] for s in each["states"]]
+    said["confidence"] = mean(s["confidence"] for s in events if s["event"] not in ("still", "unseen"))
     row = score(problem, per_visit_answer(scenes, bytes_of(loaded), said), folder)
     return {
         **row,
         **stage_seconds(out),
         "seconds_initial": initial_seconds["seconds_cpu"],
     }
+
+
+def forget_one(stages: Path) -> None:
+    """In the stages of a run, take from the template that a visit after the first change was first to find again what
+    it stands on, without which it is not looked for, and all later stages away.
+
+    Raises ValueError when no visit found any again.
+    """
+    visits = sorted(stages.glob("visit_*.safetensors"))
+    known = len(_read_stage(visits[0])[1]["templates"])
+    found = [a for path in visits[1:] for a in _read_stage(path)[1]["accounts"] if a["kind"] in ("moved", "added")]
+    again = [a["template"] for a in found if a["template"] < known]
+    if not again:
+        raise ValueError(f"{stages}: no visit found an object of the first change again")
+    content, _ = _read_stage(visits[0])
+    arrays = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 (no mapping)
+    del arrays[f"template{again[0]}.support"]
+    save_file(arrays, visits[0], content.metadata())
+    for path in (*visits[1:], *(stages / f"{name}.safetensors" for name in ("fit", "ledger", "outputs", "evaluate"))):
+        path.unlink(missing_ok=True)
+
+
+def _read_stage(path: Path):
+    """A stage's file, open, and its notes."""
+    content = safe_open(path, "numpy")
+    return content, json.loads(content.metadata()["notes"])
 
 
 def stage_seconds(out: Path) -> dict[str, float]:
