@@ -1,5 +1,7 @@
 """What a visit's evidence is taken for: light or a thing, a burden or its foot, turned or as it stood."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -25,7 +27,7 @@ from ltgs_jax.pipeline.state import (
     set_from,
     split_template,
 )
-from ltgs_jax.scene import Splats, Template, drop_hidden
+from ltgs_jax.scene import Splats, Template, drop_hidden, transform_splats
 from ltgs_jax.template import Placement, Support
 
 _FLOOR = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
@@ -170,6 +172,41 @@ def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_
         # Closed again: the first template is there, and the object changed its state once more.
         again = set_from(set_from(after, 3, 1, visible=False), 3, 0, visible=True, pose=_shifted(0.6))
         assert _track(again.chronology, 1, every)["states"][2]["event"] == "new_state"
+
+
+@pytest.mark.parametrize(
+    ("color", "height", "known"),
+    [((0.5, 0.5, 0.5), 0.2, True), ((0.9, 0.2, 0.1), 0.2, False), ((0.5, 0.5, 0.5), 0.07, False)],
+)
+@pytest.mark.parametrize(("left", "kind"), [(2, "moved"), (1, "added")])
+def test_what_shows_another_side_elsewhere_is_known_by_colours_and_shape(state, color, height, known, left, kind):
+    for t in (1, 2, 3):
+        state = set_from(state, t, 0, visible=t < left, pose=_shifted(0.6))
+    stack = state.chronology.templates[0].splats
+    turned = transform_splats(
+        SE3(jnp.asarray([np.cos(1), 0, 0, np.sin(1)], jnp.float32), jnp.asarray([-0.5, 0.3, 0.0])), stack
+    )
+    means = np.asarray(turned.means) * np.float32([1, 1, height / 0.2])
+    sh = np.tile(((np.float32(color) - 0.5) / C0)[None, None], (stack.count, 1, 1))
+    came = Template(eqx.tree_at(lambda s: (s.means, s.sh), turned, (means, sh)), 2, 2)
+    after = add_template(state, came, np.zeros(stack.count, np.float32), _FLOOR, 2)
+    accounts = [*([Account(0, "removed", 0.6, 0.1, 3)] if left == 2 else []), Account(1, "added", 0.8, 0.1, 3)]
+    joined, told = join_states(after, 2, accounts)
+    assert [m.identity for m in joined.chronology.templates] == ([1, 1] if known else [1, 2])
+    assert [a.kind for a in told] == ([kind] if known else [a.kind for a in accounts])
+    for a, b in zip(
+        jax.tree.leaves(composed(joined.chronology, 2)), jax.tree.leaves(composed(after.chronology, 2)), strict=True
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    if known:
+        track = _track(joined.chronology, 1, [[], [], told, []])["states"]
+        assert [s["event"] for s in track] == (
+            ["moved", "moved", "still"] if left == 2 else ["removed", "added", "still"]
+        )
+        assert track[1]["ambiguous_axis"] == pytest.approx([0, 0, 1], abs=1e-6)
+        np.testing.assert_allclose(track[1]["world_from_template"]["xyz"], [-0.5, 0.3, 0], atol=0.02)
+        assert track[1]["confidence"] == pytest.approx(0.8)
+        assert joined.supports[1].height(np.zeros((1, 3)))[0] == pytest.approx(0, abs=1e-6)
 
 
 def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state):

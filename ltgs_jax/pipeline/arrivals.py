@@ -183,7 +183,8 @@ def _place_known(
             progress.note(f"visit {t}: arrival {i} is not object {identity}: their {what}")
             del placements[i, k]
     accounts, known, rest = [], [], []
-    for i, k in _assigned(len(arrivals), placements, config):
+    identities = [m.identity for m in state.chronology.templates]
+    for i, k in _assigned(len(arrivals), placements, identities, config):
         if k is None:
             rest.append((arrivals[i], as_new(i)))
             continue
@@ -313,15 +314,20 @@ def _searches(
     return found
 
 
-def _assigned(count: int, placements: dict[tuple[int, int], Placement], config: Config) -> list[tuple[int, int | None]]:
-    """Each arrival with the template it is, or None for a new object: one assignment, best evidence in total."""
+def _assigned(
+    count: int, placements: dict[tuple[int, int], Placement], identities: Sequence[int], config: Config
+) -> list[tuple[int, int | None]]:
+    """Each arrival with the template it is, or None for a new object: one assignment of identities, of which each has
+    its best template, best evidence in total."""
     good = {pair: found.worth for pair, found in placements.items() if convincing(found, config)}
-    known = sorted({k for _, k in good})
+    known = sorted({identities[k] for _, k in good})
     cost = np.zeros((count, len(known) + count))
-    for (i, k), worth in good.items():
-        cost[i, known.index(k)] = -worth
+    best: dict[tuple[int, int], int] = {}
+    for (i, k), worth in sorted(good.items(), key=lambda item: item[1]):
+        j = known.index(identities[k])
+        cost[i, j], best[i, j] = -worth, k
     pairs = zip(*linear_sum_assignment(cost), strict=True) if count else ()
-    return [(i, known[j] if j < len(known) and cost[i, j] < 0 else None) for i, j in pairs]
+    return [(i, best.get((i, j))) for i, j in pairs]
 
 
 def _as_new(

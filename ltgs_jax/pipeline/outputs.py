@@ -22,6 +22,7 @@ from ltgs_jax.io import (
 from ltgs_jax.scene import Chronology, Splats, compose, drop_hidden
 
 from .looks import Eye
+from .reshaped import APART
 from .state import Account
 
 _STILL = 1e-3  # a pose that changed by less, in object sizes or radians, did not change
@@ -192,9 +193,12 @@ def _track(chronology: Chronology, identity: int, accounts: Sequence[Sequence[Ac
         elif before is None:
             event = "added"
         elif now != before:
-            event = "new_state"
+            places, sizes = zip(
+                *(_place_of(chronology, boxes[i], s, i) for s, i in ((t - 1, before), (t, now))), strict=True
+            )
+            event = "moved" if np.linalg.norm(places[1] - places[0]) > APART * max(sizes) else "new_state"
         else:
-            size = float(np.linalg.norm(boxes[k][1] - boxes[k][0]))
+            _, size = _place_of(chronology, boxes[k], t, k)
             moved, turned = pose_change(chronology.world_from_template[t - 1, k], pose, size)
             if max(moved, turned) > _STILL:
                 event = "moved"
@@ -225,6 +229,12 @@ def _track(chronology: Chronology, identity: int, accounts: Sequence[Sequence[Ac
         "size": float(np.linalg.norm(high - low)),
         "states": states,
     }
+
+
+def _place_of(chronology: Chronology, box: Float[np.ndarray, "2 3"], t: int, k: int) -> tuple[np.ndarray, float]:
+    """Where the middle of a template's box is at visit t, in world coordinates, and its diagonal."""
+    middle = chronology.world_from_template[t, k].apply(jnp.asarray(box.mean(axis=0), jnp.float32)[None])[0]
+    return np.asarray(middle), float(np.linalg.norm(box[1] - box[0]))
 
 
 def _box_of(splats: Splats) -> Float[np.ndarray, "2 3"]:

@@ -1,59 +1,123 @@
-"""Objects that changed their shape: what left, and what came in its place with its colours, are one object."""
+"""What came as new and is an object known before: its look changed, or it shows sides that no photograph had seen."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 
 from ltgs_jax.fit import template_diameter
-from ltgs_jax.geometry import C0
-from ltgs_jax.scene import Splats
+from ltgs_jax.geometry import C0, SE3
+from ltgs_jax.scene import Splats, transform_splats
+from ltgs_jax.template import Support, middle_of
 
+from .looks import on_host
 from .state import Account, State, middles_of
 
-_APART = 0.5  # between the middles of two states, in sizes of the larger, up to which one is in the other's place
-_FACTOR = 2.5  # between the sizes of two states of an object
+APART = 0.5  # between the middles of two states, in sizes of the larger, up to which one is in the other's place
+_FACTOR = 2.5  # between the sizes of two states of an object in one place
+_SHAPE = 1.4  # between the heights, and between the widths, of two states of an object in different places
 _COMMON = 0.6  # share of their colours that two states have in common
+_COMMON_ELSEWHERE = 0.53  # the same where their shapes agree
 _BINS = 4  # of each channel
 
 
 def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[State, list[Account]]:
-    """What visit t's accounts call removed and added, where it is one object in a new state: the new template gets the
-    identity of the old one, and one account in place of two (section 3.2 of the LTGS paper: changed geometry).
+    """What visit t's accounts call added, where it is an object that does not show any more: the new template gets the
+    identity of the old one, and one account in place of two.
 
-    Only something new takes part: a known template elsewhere has moved. Of several, pairs with the most colours in
-    common.
+    In the place of what left at this visit, and of its colours, it is a new state (section 3.2 of the LTGS paper:
+    changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has moved, or is
+    back, and shows sides that tell nothing of how it turned: its frame is that of the old template, shifted. Only
+    something new takes part. Of several, pairs with the most colours in common.
     """
-    templates = state.chronology.templates
-    left = [a for a in accounts if a.kind == "removed"]
+    templates, visible = state.chronology.templates, np.asarray(state.chronology.visible)
+    shown = {m.identity for k, m in enumerate(templates) if visible[t, k]}
+    hidden = [k for k, m in enumerate(templates) if m.identity not in shown and visible[:t, k].any()]
     came = [a for a in accounts if a.kind == "added" and templates[a.template].source_visit == t]
-    if not left or not came:
+    if not hidden or not came:
         return state, list(accounts)
-    common = np.array([[_in_common(state, t, a.template, b.template) for b in came] for a in left])
-    dropped, kinds = set(), {}
-    for i, j in zip(*linear_sum_assignment(-common), strict=True):
-        if common[i, j] > _COMMON:
-            old, new = left[i].template, came[j].template
-            identity = templates[old].identity
-            renamed = dataclasses.replace(state.chronology.templates[new], identity=identity)
-            state = eqx.tree_at(lambda s, k=new: s.chronology.templates[k], state, renamed)
-            dropped.add(old)
-            kinds[new] = "new_state"
-    kept = [a for a in accounts if a.template not in dropped]
-    return state, [dataclasses.replace(a, kind=kinds.get(a.template, a.kind)) for a in kept]
+    in_place = np.array([[_in_place(state, t, k, a.template) for a in came] for k in hidden])
+    elsewhere = np.array([[_of_one_shape(state, k, a.template) for a in came] for k in hidden])
+    common = np.array([[_in_common(state, k, a.template) for a in came] for k in hidden])
+    alike = (in_place & (common > _COMMON)) | (~in_place & elsewhere & (common > _COMMON_ELSEWHERE))
+    replaced, again = {}, set()
+    for i, j in zip(*linear_sum_assignment(-np.where(alike, common, 0)), strict=True):
+        old, account = hidden[i], came[j]
+        identity = templates[old].identity
+        if not alike[i, j] or identity in again:
+            continue
+        again.add(identity)
+        state = _renamed(state, account.template, identity)
+        was_there = any(visible[t - 1, k] for k, m in enumerate(templates) if m.identity == identity)
+        kind = "new_state" if in_place[i, j] else "moved" if was_there else "added"
+        axis = account.ambiguous_axis
+        if not in_place[i, j]:
+            state = _in_frame_of(state, t, account.template, old)
+            axis = tuple(map(float, state.supports[account.template].normal))
+        share = account.gain * float(common[i, j])
+        replaced[account.template] = dataclasses.replace(account, kind=kind, gain=share, ambiguous_axis=axis)
+    identities = [m.identity for m in state.chronology.templates]
+    kept = [a for a in accounts if a.kind != "removed" or identities[a.template] not in again]
+    return state, [replaced.get(a.template, a) for a in kept]
 
 
-def _in_common(state: State, t: int, old: int, new: int) -> float:
-    """Share of colours that two templates have in common; 0 where they differ in place, or much in size."""
-    before, after = (state.chronology.templates[k].splats for k in (old, new))
-    sizes = template_diameter(before), template_diameter(after)
+def _renamed(state: State, k: int, identity: int) -> State:
+    template = dataclasses.replace(state.chronology.templates[k], identity=identity)
+    return eqx.tree_at(lambda s: s.chronology.templates[k], state, template)
+
+
+def _in_frame_of(state: State, t: int, new: int, old: int) -> State:
+    """The state with a template that came at visit t, and stands where its frame is, in the frame of another, shifted
+    from middle to middle."""
+    own = middle_of(np.asarray(state.chronology.templates[old].splats.means))
+    shift = np.asarray(middles_of(state, new)[t] - own, np.float32)
+    back = SE3(jnp.asarray([1.0, 0, 0, 0], jnp.float32), jnp.asarray(-shift))
+    xyz = np.array(state.chronology.world_from_template.xyz)
+    xyz[:, new] = shift
+    return eqx.tree_at(
+        lambda s: (s.chronology.templates[new].splats, s.supports[new], s.chronology.world_from_template.xyz),
+        state,
+        (
+            on_host(transform_splats(back, state.chronology.templates[new].splats)),
+            state.supports[new].moved(back),
+            xyz,
+        ),
+    )
+
+
+def _in_place(state: State, t: int, old: int, new: int) -> bool:
+    """Whether a template came about where another left at visit t, and is not much larger or smaller."""
+    if not np.asarray(state.chronology.visible)[t - 1, old]:
+        return False
+    sizes = [template_diameter(state.chronology.templates[k].splats) for k in (old, new)]
     apart = np.linalg.norm(middles_of(state, new)[t] - middles_of(state, old)[t - 1])
-    if apart > _APART * max(sizes) or max(sizes) > _FACTOR * min(sizes):
-        return 0.0
-    return float(np.minimum(_histogram(before), _histogram(after)).sum())
+    return bool(apart <= APART * max(sizes) and max(sizes) <= _FACTOR * min(sizes))
+
+
+def _of_one_shape(state: State, old: int, new: int) -> bool:
+    """Whether two templates are about as high above what they stand on, and as wide."""
+    if state.supports[old] is None or state.supports[new] is None:
+        return False
+    a, b = (_shape(state.chronology.templates[k].splats, state.supports[k]) for k in (old, new))
+    return bool((np.maximum(a, b) < _SHAPE * np.minimum(a, b)).all())
+
+
+def _shape(splats: Splats, support: Support) -> Float[np.ndarray, "2"]:
+    """Height and width of what shows of an object, in scene units: how high it reaches, and the side of the square over
+    which as much would be spread."""
+    points = np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.1]
+    flat = np.cov(points @ support.frame()[:2].T, rowvar=False)
+    return np.array([np.quantile(support.height(points), 0.97), np.sqrt(12) * np.linalg.det(flat) ** 0.25])
+
+
+def _in_common(state: State, old: int, new: int) -> float:
+    """Share of colours that two templates have in common."""
+    before, after = (_histogram(state.chronology.templates[k].splats) for k in (old, new))
+    return float(np.minimum(before, after).sum())
 
 
 def _histogram(splats: Splats) -> Float[np.ndarray, " b"]:
