@@ -168,8 +168,10 @@ def test_the_page_says_what_happened(chronology):
 
 
 def test_the_page_says_what_each_visit_added_and_bought(chronology):
-    text, _ = _read(write_report(chronology).read_text())
+    page = write_report(chronology).read_text()
+    text, _ = _read(page)
     assert "object 1 moved" in text and "3.250" in text and "dB bought" in text
+    assert '<th class="number">KiB</th>' in page and "<th>seconds</th>" in page  # beside the seconds a bar is drawn
     (chronology / "stages.json").write_text(json.dumps([{"stage": "ledger", "counts": {"ledger": 7}}]))
     text, _ = _read(write_report(chronology).read_text())
     assert "dB bought" not in text  # what cannot be read as rows is left out

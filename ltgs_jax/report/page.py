@@ -275,7 +275,7 @@ class _Cell(str):
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    numeric = [any(isinstance(row[i], int | float) for row in rows) for i in range(len(heads))]
+    numeric = [any(_is_number(row[i]) for row in rows) for i in range(len(heads))]
     head = "".join(
         f"<th{_class(is_number)}>{escape(text)}</th>" for text, is_number in zip(heads, numeric, strict=True)
     )
@@ -295,6 +295,12 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
         body.append(f"<tr>{''.join(cells)}</tr>")
     table = f"<table data-sortable><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
     return f'<div class="scroll">{table}</div>'
+
+
+def _is_number(cell: Any) -> bool:
+    """Whether a cell shows a number and nothing drawn beside it."""
+    value = cell.value if isinstance(cell, _Cell) and "<" not in cell else cell
+    return isinstance(value, int | float)
 
 
 def _class(is_number: bool) -> str:
