@@ -9,7 +9,8 @@ import pytest
 from ltgs_jax.detect import ChangeMap
 from ltgs_jax.fit import View, VisitView
 from ltgs_jax.geometry import C0, SE3, Camera
-from ltgs_jax.pipeline.arrivals import _left_beside
+from ltgs_jax.pipeline.arrivals import _left_beside, convincing
+from ltgs_jax.pipeline.config import Config
 from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
@@ -139,6 +140,13 @@ def test_an_account_keeps_the_axis_through_json():
     assert account.ambiguous_axis == (0, 0, 1)
     assert Account.from_json(account.to_json()) == account
     assert Account.from_json({**account.to_json(), "ambiguous_axis": None}).ambiguous_axis is None
+
+
+def test_what_explains_more_than_the_change_is_no_account_of_it():
+    outlines = np.zeros((1, 2, 2), bool)
+    for gain, good in ((0.9, True), (1.2, True), (1.6, False)):
+        found = Placement(SE3.identity(), 0.1, gain, 0.9, 0.8, 1.0, outlines, None)
+        assert convincing(found, Config()) == good
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,7 @@ from .state import (
     set_from,
 )
 
+_MOST = 1.3  # share of the change that an account of it may explain: beyond, it improves what did not change
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
@@ -217,7 +218,8 @@ def _beside(
 
 def convincing(found: Placement, config: Config) -> bool:
     """Whether a known template, as placed, is what came."""
-    return found.overlap > config.template.tau_outline and found.worth > config.template.tau_same
+    good = found.overlap > config.template.tau_outline and found.worth > config.template.tau_same
+    return good and found.gain <= _MOST
 
 
 def _window(instance: Instance, observations) -> list[tuple[float, float, float]]:
@@ -399,8 +401,7 @@ def _add_new(
     """The state with a new template; ground that something had hidden joins the background instead."""
     if new is None:
         return state, None
-    # More than the change itself: it improves what did not change, and is no account of what did.
-    if not config.template.tau_new <= new.gain <= 1.3:
+    if not config.template.tau_new <= new.gain <= _MOST:
         progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
