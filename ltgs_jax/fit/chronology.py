@@ -157,11 +157,11 @@ def _window_splats(variables: _Variables, look: _Look, fixed: _Fixed) -> Splats:
     here = (fixed.placements.poses @ SE3.exp(variables.tangents))[index]
     still = SE3.identity((1,), splats.means.dtype)
     here = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), still, here)
-    owner = fixed.owner.at[rows].get(mode="clip")
+    owner = _taken(fixed.owner, rows)
     shade = jnp.pad(variables.shades[index], ((1, 0), (0, 0)))[owner]
     along = (splats.means - fixed.frames[owner, :3]) / fixed.frames[owner, 3:]
     shadows = eqx.tree_at(lambda s: s.log_gain, fixed.shadows, variables.shadows)
-    since = fixed.since.at[rows].get(mode="clip")
+    since = _taken(fixed.since, rows)
     places = jax.lax.stop_gradient(splats.means)  # no splat is pulled into a shadow
     gain = jnp.where(owner == 0, ground_gain(shadows, places, since, visit), shade[:, 0])
     lit = shade_splats(splats, gain + jnp.sum(shade[:, 1:] * along, axis=-1))
@@ -190,7 +190,7 @@ def _objective(variables: _Variables, look: _Look, fixed: _Fixed, *, config: Lon
     target = window.image.astype(jnp.float32) / 255
     loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
     needle = jax.nn.relu(jnp.ptp(own.log_scales, axis=-1) - jnp.log(8.0))
-    mine = (fixed.owner.at[look.rows].get(mode="clip") > 0) & (look.rows < fixed.owner.shape[0])
+    mine = (_taken(fixed.owner, look.rows) > 0) & (look.rows < fixed.owner.shape[0])
     needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
     return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
 
@@ -204,7 +204,7 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     def put(tree, part):
         return jax.tree.map(lambda leaf, new: leaf.at[rows].set(new, mode="drop"), tree, part)
 
-    came = fixed.came.at[rows].get(mode="clip")
+    came = _taken(fixed.came, rows)
     local = eqx.tree_at(lambda v: v.splats, variables, _taken(variables.splats, rows))
     objective = partial(_objective, config=config, plan=plan)
     gradient, loss, overflow = mean_gradient(objective, local, looks, fixed, mesh)
@@ -364,6 +364,7 @@ def _fit_windows(
     replayed = config.replay if first else 0.0
     mesh = mesh_for(config.batch)
     steps = round(config.passes * len(later) / max(1 - replayed, 0.1) / config.batch)
+    steps = max(steps, 1) if later else 0
     losses = np.zeros(steps, np.float32)
     if steps == 0:
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
