@@ -6,10 +6,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from test_fit import _camera, _moved_chronology, _view
 
+from ltgs_jax.fit import LongConfig, VisitView, fit_chronology
 from ltgs_jax.fit.initial import _draw
+from ltgs_jax.scene import compose
 
 _PROGRAM = """
 import json
@@ -53,6 +57,14 @@ def test_a_batch_over_two_devices_is_fitted_as_on_one():
         np.testing.assert_allclose(two[kind], losses, rtol=1e-5, atol=1e-7)
     for a, b in zip(one["arrays"], two["arrays"], strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=5e-4)  # Adam makes more of the order of sums than they are
+
+
+@pytest.mark.slow
+def test_a_batch_of_more_windows_than_there_are_still_takes_a_step():
+    truth, off = _moved_chronology(0.06)
+    views = [VisitView(_view(compose(truth, 1), _camera(0.0)), 1)]
+    _, losses = fit_chronology(off, views, key=jax.random.key(0), config=LongConfig(passes=1, batch=4))
+    assert len(losses) == 1
 
 
 def test_a_batch_is_of_one_size_and_every_photograph_has_its_turn():
