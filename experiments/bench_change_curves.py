@@ -29,7 +29,8 @@ from ltgs_jax.io import load_image, load_mask, read_capture
 from ltgs_jax.metrics import mask_f1
 from ltgs_jax.pipeline import PRESETS, for_small_photographs
 from ltgs_jax.pipeline.evaluate import changed_names, read_truth
-from ltgs_jax.pipeline.looks import Eye, Observation, expected_errors
+from ltgs_jax.pipeline.expected import expected_errors
+from ltgs_jax.pipeline.looks import Eye, Observation
 from ltgs_jax.pipeline.state import State, scene_at
 from ltgs_jax.pipeline.visit import explain_visit
 from ltgs_jax.scene import Splats

@@ -14,9 +14,9 @@ from ltgs_jax.pipeline.config import Config
 from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
-from ltgs_jax.pipeline.looks import Evidence, Eye, Observation
+from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host
 from ltgs_jax.pipeline.outputs import _name_of, _track
-from ltgs_jax.pipeline.prune import drop_idle
+from ltgs_jax.pipeline.prune import drop_idle, merge_ground
 from ltgs_jax.pipeline.reshaped import join_states
 from ltgs_jax.pipeline.state import (
     Account,
@@ -30,6 +30,7 @@ from ltgs_jax.pipeline.state import (
 )
 from ltgs_jax.scene import Splats, Template, drop_hidden, transform_splats
 from ltgs_jax.template import Placement, Support
+from ltgs_jax.template.background import flat_splats
 
 _FLOOR = Support(np.array([0.0, 0, 1]), 0.0, 0.002)
 
@@ -243,3 +244,41 @@ def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state
     assert len(after.errors) == len(after.guessed) == len(since)
     untouched = State.of_initial(bright, np.zeros(200, np.float32), ("a", "b", "c", "d"))
     assert drop_idle(untouched, views, eye)[1] == 0
+
+
+@pytest.fixture
+def laid(state) -> State:
+    """The same, with ground that two visits laid in plain squares, half of the first one printed."""
+    grid = np.stack(np.meshgrid(np.arange(16), np.arange(16), indexing="ij"), axis=-1).reshape(-1, 2)
+    plane = _FLOOR.frame()[:2]
+    for t, corner in ((1, [-0.9, -0.9]), (3, [0.2, 0.2])):
+        colors = np.full((256, 3), 0.4)
+        if t == 1:
+            colors[grid[:, 0] < 8] = np.where((grid[:128].sum(axis=1) % 2)[:, None], 0.3, 0.6)
+        points = (np.asarray(corner) + 0.04 * grid) @ plane
+        ground = flat_splats(points, colors, support=_FLOOR, spacing=0.04, opacity=0.95, coefficients=1)
+        state = extend_background(state, on_host(ground), np.full(256, 0.1), np.arange(256) < 3, t)
+    return state
+
+
+def test_plain_ground_is_laid_with_fewer_splats_and_printed_ground_stays(laid):
+    lean = merge_ground(laid)
+    since = np.asarray(lean.chronology.since)
+    before = laid.chronology
+    for leaf, old in zip(jax.tree.leaves(lean.chronology.background), jax.tree.leaves(before.background), strict=True):
+        np.testing.assert_array_equal(leaf[since == 0], old[np.asarray(before.since) == 0])
+    assert (since == 1).sum() == 128 + 128 // 16
+    assert (since == 3).sum() == 256 // 16
+    assert len(lean.errors) == len(lean.guessed) == len(since)
+    assert lean.guessed[since == 3].sum() == 1
+    down = SE3(jnp.asarray([0.0, 1, 0, 0]), jnp.asarray([0.0, 0.0, 2.0]))
+    camera = Camera(down, jnp.asarray([[80.0, 0, 80], [0, 80, 80], [0, 0, 1]]), 160, 160)
+    eye = Eye()
+    for t in (0, 1, 3):
+        difference = eye.image(composed(lean.chronology, t), camera) - eye.image(composed(before, t), camera)
+        assert np.abs(difference).mean() < (0.006 if t else 1e-6), t  # the squares' borders are softer
+    inner = np.all(np.indices((16, 16)).reshape(2, -1) // 4 % 3 > 0, axis=0)  # neither of the first nor the last four
+    places, _ = camera.project(jnp.asarray(before.background.means[np.asarray(before.since) == 3][inner]))
+    column, row = np.floor(np.asarray(places)).astype(int).T
+    assert inner.sum() == 64
+    assert np.abs(difference[row, column]).max() < 0.02

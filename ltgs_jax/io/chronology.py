@@ -22,6 +22,7 @@ M = TypeVar("M", bound=eqx.Module)
 
 _VERSION = 1
 _DTYPES = ("float32", "float64")
+_VISITS = ("uint8", "uint16", "uint32", "int32")
 PRECISIONS = ("full", "half", "8-bit")
 """How the splats of a chronology are stored, but for their centres: as they are, in half precision, or each component
 in 256 steps over its range."""
@@ -58,7 +59,8 @@ def save_chronology(folder: str | Path, chronology: Chronology, *, precision: st
         "exposure": chronology.exposure,
     }
     if chronology.since is not None:
-        arrays["background.since"] = chronology.since
+        since = np.asarray(chronology.since)
+        arrays["background.since"] = since.astype(np.min_scalar_type(since.max(initial=0)))
     if chronology.shade is not None:
         arrays["shade"] = chronology.shade
     if chronology.shadows is not None:
@@ -98,8 +100,8 @@ def _stored(key: str, array: np.ndarray, precision: str) -> dict[str, np.ndarray
 
 
 def load_chronology(folder: str | Path) -> Chronology:
-    """The chronology that `save_chronology` wrote: bit for bit, in the dtypes that it had, or what is nearest to it, in
-    float32, where it was stored in less than full precision.
+    """The chronology that `save_chronology` wrote: bit for bit, in the dtypes that it had (`since`: int32), or what is
+    nearest to it, in float32, where it was stored in less than full precision.
 
     Raises InputError that names the file when it is missing, cut short, or does not fit together.
     """
@@ -127,7 +129,7 @@ def load_chronology(folder: str | Path) -> Chronology:
         exposure=take("exposure", (p, 3, 2)),
         visits=visits,
         photographs=photographs,
-        since=take("background.since", (n,), dtypes=("int32",)) if "background.since" in arrays else None,
+        since=take("background.since", (n,), dtypes=_VISITS).astype(np.int32) if "background.since" in arrays else None,
         shade=take("shade", (t, k, 4)) if "shade" in arrays else None,
         shadows=take.shadows(t) if "shadows.cast" in arrays else None,
     )

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ltgs_jax.detect import ChangeMap, change_map, dilate, similarity
+from ltgs_jax.detect import ChangeMap, change_map, dilate
 from ltgs_jax.features import FrontEnd
-from ltgs_jax.fit import StreamedView, View
 from ltgs_jax.geometry import Camera, eval_sh
 from ltgs_jax.match import Cone
 from ltgs_jax.render import RenderOutput, RenderPlan, plan_render, render, splat_votes
@@ -155,19 +154,6 @@ def compare(
         for look, o in zip(looks, observations, strict=True)
     ]
     return Evidence(tuple(looks), tuple(changes))
-
-
-def expected_errors(
-    eye: Eye, splats: Splats, views: Sequence[View | StreamedView], front_end: FrontEnd, *, gamma: float
-) -> Float[np.ndarray, " n"]:
-    """The dissimilarity that each splat leaves in the photographs it was fitted to, from a dozen of them."""
-    votes = np.zeros((splats.count, 2))
-    for view in views[:: max(1, len(views) // 12)]:
-        image = view.image.astype(np.float32) / 255
-        unlike = 1 - similarity(eye.image(splats, view.camera), image, front_end, gamma=gamma)
-        votes += eye.votes(splats, view.camera, np.stack([unlike * view.mask, view.mask], axis=-1))
-    # A prior of two pixels that disagree by half: what the photographs hardly showed is not to be relied on.
-    return ((votes[:, 0] + 2 * 0.5) / (votes[:, 1] + 2)).astype(np.float32)
 
 
 def unlike_where_different(

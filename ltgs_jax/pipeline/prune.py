@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from ltgs_jax.fit import VisitView
+from ltgs_jax.template import coarser
 
 from .ledger import squared_error
-from .looks import Eye
-from .state import State, composed, cut_background, cut_template
+from .looks import Eye, on_host
+from .state import State, composed, cut_background, cut_template, extend_background
 
 _PRICE = 2e-3  # growth of the squared error over all later photographs for which the splats that show least may go
 _FEW = 8  # splats that a template must keep
@@ -55,6 +56,24 @@ def drop_idle(state: State, views: Sequence[VisitView], eye: Eye) -> tuple[State
     for k in range(len(state.chronology.templates)):
         state = cut_template(state, k, gone[owner == k + 1])
     return state, int(gone.sum())
+
+
+def merge_ground(state: State) -> State:
+    """The state with the ground that later visits laid no denser than its colours ask for."""
+    since = np.asarray(state.chronology.since)
+    late = since > 0
+    if not late.any():
+        return state
+    merged, row = coarser(on_host(state.chronology.background)[late], since[late])
+    errors, guessed = np.zeros(merged.count, state.errors.dtype), np.zeros(merged.count, bool)
+    np.maximum.at(errors, row, state.errors[late])
+    np.logical_or.at(guessed, row, state.guessed[late])
+    visit = since[late][np.unique(row, return_index=True)[1]]
+    state = cut_background(state, late)
+    for t in np.unique(visit):
+        of = visit == t
+        state = extend_background(state, merged[of], errors[of], guessed[of], int(t))
+    return state
 
 
 def _late_splats(state: State) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:

@@ -33,13 +33,14 @@ from ltgs_jax.scene import Chronology, Splats, drop_hidden
 from .cameras import Run, hold_against_renders, locate_photographs, scaled_camera
 from .config import Config, check_config
 from .evaluate import evaluate
+from .expected import expected_errors
 from .hold import only_run
 from .ledger import make_ledger
-from .looks import Eye, Observation, expected_errors
+from .looks import Eye, Observation
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
-from .prune import drop_idle
+from .prune import drop_idle, merge_ground
 from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
@@ -151,24 +152,32 @@ def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye,
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
     config = run.config
 
+    def fit(views, options):
+        start = splats_from_points(
+            run.capture.points,
+            run.capture.point_colors,
+            capacity=options.max_splats,
+            sh_degree=options.sh_degree,
+        )
+        return fit_initial(start, views, key=jax.random.key(run.seed), config=options, progress=progress.step).splats
+
     def compute():
         views = [view for _, view in load_views(run, run.posed(0, "train"), progress)]
-        if scene is not None:
-            splats = scene
-        else:
-            if len(run.capture.points) < 4:
-                raise InputError(f"{run.capture.folder}: too few sparse points to start from; give --initial PLY")
-            start = splats_from_points(
-                run.capture.points,
-                run.capture.point_colors,
-                capacity=config.fit.initial.max_splats,
-                sh_degree=config.fit.initial.sh_degree,
-            )
-            splats = fit_initial(
-                start, views, key=jax.random.key(run.seed), config=config.fit.initial, progress=progress.step
-            ).splats
+        options, startable = config.fit.initial, len(run.capture.points) >= 4
+        if scene is None and not startable:
+            raise InputError(f"{run.capture.folder}: too few sparse points to start from; give --initial PLY")
+        splats = fit(views, options) if scene is None else scene
         progress.note("measuring what difference is to be expected")
-        errors = expected_errors(eye, splats, views, front_end, gamma=config.detect.gamma)
+        short = dataclasses.replace(options, steps=-(-options.steps // 4), grow_every=-(-options.grow_every // 4))
+        errors = expected_errors(
+            eye,
+            splats,
+            views,
+            front_end,
+            gamma=config.detect.gamma,
+            fit_to=partial(fit, options=short) if startable else None,
+            progress=progress,
+        )
         return {**arrays_of("splats", splats), "errors": errors}, {"counts": {"splats": splats.count}}
 
     arrays, _ = store.run("initial", key, compute)
@@ -231,18 +240,21 @@ def _long_fit(store: Store, key: str, run: Run, state: State, later, eye: Eye, p
             progress.note("nothing changed: the chronology is the initial scene")
             arrays, notes = pack_state(state)
             return arrays, {**notes, "counts": {"steps": 0}}
+        lean = merge_ground(state)
         first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
         chronology, losses = fit_chronology(
-            state.chronology,
+            lean.chronology,
             first + later(),
             key=jax.random.key(run.seed + 1),
             config=config.fit.long,
             progress=progress.step,
         )
-        fitted = eqx.tree_at(lambda s: s.chronology, state, jax.tree.map(np.asarray, chronology))
+        fitted = eqx.tree_at(lambda s: s.chronology, lean, jax.tree.map(np.asarray, chronology))
         fitted, idle = drop_idle(fitted, later(), eye)
         arrays, notes = pack_state(fitted)
-        return arrays, {**notes, "counts": {"steps": len(losses), "splats_dropped": idle}}
+        merged = state.chronology.background.count - lean.chronology.background.count
+        counts = {"steps": len(losses), "splats_merged": merged, "splats_dropped": idle}
+        return arrays, {**notes, "counts": counts}
 
     arrays, notes = store.run("fit", key, compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology

@@ -8,6 +8,7 @@ from .arrival import place_template as place_template
 from .arrival import search_template as search_template
 from .arrival import settle_template as settle_template
 from .arrival import support_below as support_below
+from .background import coarser as coarser
 from .background import color_from_photographs as color_from_photographs
 from .background import fill_under as fill_under
 from .config import TemplateConfig as TemplateConfig

@@ -5,14 +5,16 @@ from collections.abc import Sequence
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
-from ltgs_jax.geometry import C0, quat_from_rotmat
+from ltgs_jax.geometry import C0, quat_from_rotmat, rotmat_from_quat
 from ltgs_jax.scene import Splats
 
 from .config import TemplateConfig
 from .support import Support, convex_footprint
+
+_RADIUS = 0.7  # standard deviation of a disc of ground, in spacings of their grid
 
 
 def flat_splats(
@@ -31,7 +33,7 @@ def flat_splats(
     sh = np.zeros((n, coefficients, 3), np.float32)
     sh[:, 0] = (colors - 0.5) / C0
     quat = quat_from_rotmat(jnp.asarray(rotmat, jnp.float32))
-    scales = np.log([0.7 * spacing, 0.7 * spacing, 0.1 * spacing])
+    scales = np.log([_RADIUS * spacing, _RADIUS * spacing, 0.1 * spacing])
     return Splats(
         means=jnp.asarray(points, jnp.float32),
         quats=jnp.tile(quat, (n, 1)),
@@ -39,6 +41,61 @@ def flat_splats(
         logit_opacities=jnp.full(n, np.log(opacity / (1 - opacity)), jnp.float32),
         sh=jnp.asarray(sh),
     )
+
+
+def coarser(
+    splats: Splats, since: Int[np.ndarray, " n"], *, alike: float = 0.12, levels: int = 2
+) -> tuple[Splats, Int[np.ndarray, " n"]]:
+    """Squares of four `flat_splats` of one grid as one disc of twice the size, where their colours agree within `alike`
+    (in 0…1), and those again; and for each splat that was given, the row it became part of. `since`: the visit from
+    which on each shows; those of different visits stay apart.
+
+    A quadtree: a grid fine enough for the print of what it shows is finer than bare ground needs.
+    """
+    row = np.arange(splats.count)
+    for _ in range(levels):
+        group = _squares(splats, since, alike)
+        first = np.unique(group, return_index=True)[1]
+        count = np.bincount(group)
+
+        def mean(leaf, group=group, count=count):
+            columns = np.asarray(leaf, np.float64).reshape(len(leaf), -1).T
+            return (np.stack([np.bincount(group, column) for column in columns]) / count).T
+
+        merged = splats[first]
+        grown = np.log(np.where(count == 4, 2, 1))[:, None] * np.array([1, 1, 0])
+        splats = Splats(
+            means=mean(splats.means).astype(np.float32),
+            quats=merged.quats,
+            log_scales=(merged.log_scales + grown).astype(np.float32),
+            logit_opacities=merged.logit_opacities,
+            sh=mean(splats.sh).reshape(merged.sh.shape).astype(np.float32),
+        )
+        row, since = group[row], since[first]
+    return splats, row
+
+
+def _squares(splats: Splats, since: Int[np.ndarray, " n"], alike: float) -> Int[np.ndarray, " n"]:
+    """The square of four alike neighbours that each disc is in, by number; one of its own where there are no four."""
+    quats, logs = np.asarray(splats.quats), np.asarray(splats.log_scales)
+    spacing = np.exp(logs[:, :1]).astype(np.float64) / _RADIUS
+    axes = np.asarray(rotmat_from_quat(jnp.asarray(quats)), np.float64)
+    local = np.einsum("nji,nj->ni", axes, np.asarray(splats.means, np.float64)) / spacing
+    alike_in = np.column_stack([since, quats, logs, local[:, 2] / 4])
+    kind = np.unique(np.round(alike_in, 3), axis=0, return_inverse=True)[1].ravel()
+    low = np.full((kind.max(initial=0) + 1, 2), np.inf)
+    np.minimum.at(low, kind, local[:, :2])
+    # Of two by two grid points; the quarter keeps them off the cells' borders.
+    cell = np.floor((local[:, :2] - low[kind] + 0.25) / 2).astype(int)
+    group = np.unique(np.column_stack([kind, cell]), axis=0, return_inverse=True)[1].ravel()
+    colors = np.asarray(splats.sh)[:, 0] * C0
+    most, least = np.full((group.max(initial=0) + 1, 3), -np.inf), np.full((group.max(initial=0) + 1, 3), np.inf)
+    np.maximum.at(most, group, colors)
+    np.minimum.at(least, group, colors)
+    whole = (np.bincount(group) == 4) & ((most - least).max(axis=1) <= alike)
+    alone = ~whole[group]
+    group = np.where(alone, group.max(initial=0) + 1 + np.arange(len(group)), group)
+    return np.unique(group, return_inverse=True)[1].ravel()
 
 
 def color_from_photographs(
