@@ -16,7 +16,7 @@ from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
 from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host
 from ltgs_jax.pipeline.outputs import _name_of, _track
-from ltgs_jax.pipeline.prune import drop_idle, merge_ground
+from ltgs_jax.pipeline.prune import drop_idle, late_splats, merge_ground
 from ltgs_jax.pipeline.reshaped import join_states
 from ltgs_jax.pipeline.state import (
     Account,
@@ -24,11 +24,12 @@ from ltgs_jax.pipeline.state import (
     add_template,
     composed,
     extend_background,
+    extend_template,
     hand_over,
     set_from,
     split_template,
 )
-from ltgs_jax.scene import Splats, Template, drop_hidden, transform_splats
+from ltgs_jax.scene import Splats, Template, concatenate_splats, drop_hidden, transform_splats
 from ltgs_jax.template import Placement, Support
 from ltgs_jax.template.background import flat_splats
 
@@ -235,7 +236,8 @@ def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state
     for t in (2, 3):
         image = np.rint(255 * eye.image(drop_hidden(composed(state.chronology, t)), camera)).astype(np.uint8)
         views.append(VisitView(View(camera, image, np.ones((48, 64), bool)), t))
-    after, dropped = drop_idle(state, views, eye)
+    late = np.asarray(state.chronology.since) > 0
+    after, dropped = drop_idle(state, np.pad(late, (0, 180)), views, eye)
     since = np.asarray(after.chronology.since)
     heights = np.asarray(after.chronology.background.means)[since == 2, 2]
     assert (since == 0).sum() == 6400
@@ -243,7 +245,20 @@ def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state
     assert dropped == 500 - (since == 2).sum()
     assert len(after.errors) == len(after.guessed) == len(since)
     untouched = State.of_initial(bright, np.zeros(200, np.float32), ("a", "b", "c", "d"))
-    assert drop_idle(untouched, views, eye)[1] == 0
+    assert drop_idle(untouched, np.zeros(200, bool), views, eye)[1] == 0
+
+
+def test_what_later_visits_added_to_an_object_of_the_first_is_theirs(state):
+    rng = np.random.default_rng(10)
+    floor, stack = state.chronology.background, state.chronology.templates[0].splats
+    first = concatenate_splats([stack, floor])
+    assert not late_splats(state, first).any()
+    lid, mug = _box(rng, 20, [-0.1, -0.1, 0.2], [0.1, 0.1, 0.21]), _box(rng, 30, [0.5, 0.5, 0], [0.6, 0.6, 0.1])
+    grown = extend_template(state, 0, lid, np.zeros(20, np.float32))
+    grown = extend_background(grown, lid, np.zeros(20), np.zeros(20, bool), 1)
+    grown = add_template(grown, Template(mug, 2, 2), np.zeros(30, np.float32), _FLOOR, 2)
+    late = late_splats(grown, first)
+    np.testing.assert_array_equal(late, np.repeat([False, True, False, True, True], [400, 20, 180, 20, 30]))
 
 
 @pytest.fixture

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from ltgs_jax.fit import VisitView
+from ltgs_jax.scene import Splats, Template
 from ltgs_jax.template import coarser
 
 from .ledger import squared_error
@@ -17,15 +18,30 @@ _FEW = 8  # splats that a template must keep
 _HALVINGS = 6  # of the number of splats in question
 
 
-def drop_idle(state: State, views: Sequence[VisitView], eye: Eye) -> tuple[State, int]:
-    """The state without as many as possible of the splats that later visits added, those that show least first, at no
-    more than a price in squared error over photographs of later visits; and how many went.
+def late_splats(state: State, first: Splats) -> Bool[np.ndarray, " n"]:
+    """Which splats, the background's and then each template's, are none of the `first` scene's, before any fit: what a
+    later visit laid, built, or added to an object of the first, which has the world's frame."""
+    chronology = state.chronology
+    known = {row.tobytes() for row in np.asarray(first.means)}
+
+    def came(template: Template) -> Bool[np.ndarray, " m"]:
+        if template.source_visit > 0:
+            return np.ones(template.splats.count, bool)
+        return np.array([row.tobytes() not in known for row in np.asarray(template.splats.means)], bool)
+
+    return np.concatenate([np.asarray(chronology.since) > 0, *map(came, chronology.templates)])
+
+
+def drop_idle(state: State, late: Bool[np.ndarray, " n"], views: Sequence[VisitView], eye: Eye) -> tuple[State, int]:
+    """The state without as many as possible of its `late_splats`, those that show least first, at no more than a price
+    in squared error over photographs of later visits; and how many went.
 
     What came with the first visit stays as it is.
     """
-    owner, late = _late_splats(state)
     if not late.any():
         return state, 0
+    counts = [state.chronology.background.count, *(m.splats.count for m in state.chronology.templates)]
+    owner = np.repeat(np.arange(len(counts)), counts)
     visits = {v.visit: [w for w in views if w.visit == v.visit] for v in views}
     scenes = {t: composed(state.chronology, t) for t in visits}
     showing = {t: np.asarray(scene.logit_opacities) > -np.inf for t, scene in scenes.items()}
@@ -74,11 +90,3 @@ def merge_ground(state: State) -> State:
         of = visit == t
         state = extend_background(state, merged[of], errors[of], guessed[of], int(t))
     return state
-
-
-def _late_splats(state: State) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Whose each splat is (0 the background's, 1 + k template k's), and whether a later visit added it."""
-    chronology = state.chronology
-    counts = [chronology.background.count, *(m.splats.count for m in chronology.templates)]
-    came = [np.full(m.splats.count, m.source_visit > 0) for m in chronology.templates]
-    return np.repeat(np.arange(len(counts)), counts), np.concatenate([np.asarray(chronology.since) > 0, *came])

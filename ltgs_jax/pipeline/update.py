@@ -40,7 +40,7 @@ from .looks import Eye, Observation
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
-from .prune import drop_idle, merge_ground
+from .prune import drop_idle, late_splats, merge_ground
 from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
@@ -109,7 +109,7 @@ def update(
             accounts.append(told)
         key = digest(key, "fit", config.fit.long)
         later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
-        chronology = _long_fit(store, key, run, state, later, eye, progress)
+        chronology = _long_fit(store, key, run, state, splats, later, eye, progress)
         _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
@@ -231,7 +231,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
     return unpack_state(arrays, notes, run.capture.visits), [Account.from_json(a) for a in notes["accounts"]]
 
 
-def _long_fit(store: Store, key: str, run: Run, state: State, later, eye: Eye, progress) -> Chronology:
+def _long_fit(store: Store, key: str, run: Run, state: State, initial: Splats, later, eye: Eye, progress) -> Chronology:
     """Everything together; skipped, and said so, when nothing changed."""
     config = run.config
 
@@ -250,7 +250,7 @@ def _long_fit(store: Store, key: str, run: Run, state: State, later, eye: Eye, p
             progress=progress.step,
         )
         fitted = eqx.tree_at(lambda s: s.chronology, lean, jax.tree.map(np.asarray, chronology))
-        fitted, idle = drop_idle(fitted, later(), eye)
+        fitted, idle = drop_idle(fitted, late_splats(lean, initial), later(), eye)
         arrays, notes = pack_state(fitted)
         merged = state.chronology.background.count - lean.chronology.background.count
         counts = {"steps": len(losses), "splats_merged": merged, "splats_dropped": idle}
