@@ -219,6 +219,19 @@ def test_what_shows_another_side_elsewhere_is_known_by_colours_and_shape(state, 
         assert joined.supports[1].height(np.zeros((1, 3)))[0] == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize(("rival", "known"), [((0.5, 0.5, 0.5), False), ((0.2, 0.7, 0.3), True)])
+def test_colours_tell_nothing_where_another_object_has_them_too(state, rival, known):
+    for t in (1, 2, 3):
+        state = set_from(state, t, 0, visible=False)
+    rng, stack = np.random.default_rng(11), state.chronology.templates[0].splats
+    tray = _box(rng, 90, [-0.9, -0.9, 0], [-0.4, -0.4, 0.01], rival)
+    state = add_template(state, Template(tray, 2, 0), np.zeros(90, np.float32), _FLOOR, 0)
+    came = Template(transform_splats(_shifted(-0.5), stack), 3, 2)
+    after = add_template(state, came, np.zeros(stack.count, np.float32), _FLOOR, 2)
+    joined, _ = join_states(after, 2, [Account(2, "added", 0.8, 0.1, 3)])
+    assert [m.identity for m in joined.chronology.templates] == [1, 2, 1 if known else 3]
+
+
 def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state):
     rng, eye = np.random.default_rng(9), Eye()
     bright = _box(rng, 200, [-0.9, -0.6, 0.01], [-0.4, 0.6, 0.02], (0.9, 0.9, 0.2))

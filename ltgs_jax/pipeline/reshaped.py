@@ -20,9 +20,12 @@ from .state import Account, State, middles_of
 APART = 0.5  # between the middles of two states, in sizes of the larger, up to which one is in the other's place
 _FACTOR = 2.5  # between the sizes of two states of an object in one place
 _SHAPE = 1.4  # between the heights, and between the widths, of two states of an object in different places
-_COMMON = 0.6  # share of their colours that two states have in common
-_COMMON_ELSEWHERE = 0.53  # the same where their shapes agree
-_BINS = 4  # of each channel
+_COMMON = 0.55  # share of their colours that two states have in common
+_COMMON_ELSEWHERE = 0.45  # the same where their shapes agree
+_STANDS_OUT = (
+    1.3  # times what the new one has in common with any other object: where all are alike, colours tell nothing
+)
+_BINS = 6  # of each channel
 
 
 def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[State, list[Account]]:
@@ -31,8 +34,9 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
 
     In the place of what left at this visit, and of its colours, it is a new state (section 3.2 of the LTGS paper:
     changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has moved, or is
-    back, and shows sides that tell nothing of how it turned: its frame is that of the old template, shifted. Only
-    something new takes part. Of several, pairs with the most colours in common.
+    back, and shows sides that tell nothing of how it turned: its frame is that of the old template, shifted. No other
+    known object may have nearly as many colours in common with it. Only something new takes part. Of several, pairs
+    with the most colours in common.
     """
     templates, visible = state.chronology.templates, np.asarray(state.chronology.visible)
     shown = {m.identity for k, m in enumerate(templates) if visible[t, k]}
@@ -42,8 +46,13 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
         return state, list(accounts)
     in_place = np.array([[_in_place(state, t, k, a.template) for a in came] for k in hidden])
     elsewhere = np.array([[_of_one_shape(state, k, a.template) for a in came] for k in hidden])
-    common = np.array([[_in_common(state, k, a.template) for a in came] for k in hidden])
+    known = [k for k in range(len(templates)) if k not in {a.template for a in came}]
+    shared = np.array([[_in_common(state, k, a.template) for a in came] for k in known])
+    common = shared[[known.index(k) for k in hidden]]
+    others = [[templates[o].identity != templates[k].identity for o in known] for k in hidden]
+    rival = np.max(np.where(np.asarray(others)[..., None], shared, 0), axis=1)
     alike = (in_place & (common > _COMMON)) | (~in_place & elsewhere & (common > _COMMON_ELSEWHERE))
+    alike &= common > _STANDS_OUT * rival
     replaced, again = {}, set()
     for i, j in zip(*linear_sum_assignment(-np.where(alike, common, 0)), strict=True):
         old, account = hidden[i], came[j]
