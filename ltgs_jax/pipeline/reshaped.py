@@ -22,9 +22,7 @@ _FACTOR = 2.5  # between the sizes of two states of an object in one place
 _SHAPE = 1.4  # between the heights, and between the widths, of two states of an object in different places
 _COMMON = 0.55  # share of their colours that two states have in common
 _COMMON_ELSEWHERE = 0.45  # the same where their shapes agree
-_STANDS_OUT = (
-    1.3  # times what the new one has in common with any other object: where all are alike, colours tell nothing
-)
+_STANDS_OUT = 1.3  # times what is new has in common with any other object; where all are alike, colours tell nothing
 _BINS = 6  # of each channel
 
 
