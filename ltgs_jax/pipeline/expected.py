@@ -31,7 +31,8 @@ def expected_errors(
 
     A fit to few photographs explains them whatever it knows of the room. Where half of the splats are shown by fewer
     than four, the expectation is at least what scenes that were fitted without a photograph (`fit_to` some of the
-    views) leave in that photograph: cross-validation in five folds. Without `fit_to` this is left out, and said.
+    views) leave in that photograph: cross-validation in five folds. Without `fit_to` this is left out, and said;
+    without `progress`, for scenes known to be shown often enough, it is not asked.
     """
     sampled = views[:: max(1, len(views) // _SAMPLE)]
     votes = [_votes(eye, splats, splats, view, front_end, gamma) for view in sampled]
