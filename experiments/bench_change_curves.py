@@ -210,12 +210,12 @@ def score_views(point: Point, stage: Stage) -> dict:
         observations.append(dataclasses.replace(shot, image=tone(shot.image)))
     rng = np.random.default_rng([0, 1])
     options = {"earlier": lambda t: [], "eye": eye, "config": config, "rng": rng, "progress": Silent()}
-    state, accounts, _ = explain_visit(state, 1, observations, front_end, **options)
-    changed = [account.template for account in accounts]
+    explained = explain_visit(state, 1, observations, front_end, **options)
+    state, changed = explained.state, [account.template for account in explained.accounts]
     held = [shot for shot, _ in stage.held]
     covers = [eye.cover(scene_at(state, t), changed, held) for t in (0, 1)]
     found = [before | now for before, now in zip(*covers, strict=True)]
-    return {**pixel_scores(found, [true for _, true in stage.held]), "objects": len(accounts)}
+    return {**pixel_scores(found, [true for _, true in stage.held]), "objects": len(changed)}
 
 
 def curve_points(base: Point, model: str) -> dict[str, list[tuple[float | str, Run]]]:

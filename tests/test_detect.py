@@ -48,6 +48,34 @@ def test_identical_images_give_an_empty_mask():
     assert not found.two_classes
 
 
+@pytest.mark.parametrize(
+    "other", [lambda room: _room(11), lambda room: room[::-1], lambda room: np.roll(room, 16, axis=1)]
+)
+def test_a_picture_changed_everywhere_says_so_and_finds_nothing(other):
+    room = _room(4)
+    valid = np.ones(room.shape[:2], bool)
+    found = change_map(room, other(room), np.full(room.shape[:2], 0.02, np.float32), valid, Classical())
+    assert found.everywhere
+    assert not found.mask.any()
+    assert not found.score.any()
+    assert not found.left.any()
+
+
+def test_noise_blur_light_and_a_large_object_are_not_a_change_everywhere():
+    room = _room(4)
+    valid = np.ones(room.shape[:2], bool)
+    noisy = room + np.random.default_rng(12).normal(scale=0.02, size=room.shape).astype(np.float32)
+    blurred = ndimage.gaussian_filter(room, (1, 1, 0))
+    large = room.copy()
+    large[:, :50] = _room(13)[:, :50]
+    for picture in (noisy, blurred, np.clip(0.6 * room, 0, 1), large):
+        lit = fit_tone(picture, room, valid)(picture)
+        found = change_map(room, lit, np.full(room.shape[:2], 0.02, np.float32), valid, Classical())
+        assert not found.everywhere
+        assert found.mask.mean() < 0.5
+    assert found.mask[:, 5:45].mean() > 0.8
+
+
 def test_a_new_object_is_found_and_noise_is_not():
     room = _room(5)
     rng = np.random.default_rng(6)

@@ -212,6 +212,29 @@ def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
         update_stage.load_views(run, used[:1], progress)
 
 
+@pytest.mark.parametrize("strange", [1, 3])
+def test_a_photograph_of_something_else_is_left_out_and_said(run, capture, tmp_path, strange):
+    copy = tmp_path / "capture"
+    shutil.copytree(capture, copy)
+    used = read_capture(copy).at(1, "update")
+    for photograph in used[strange:]:  # the others show that nothing changed
+        shutil.copy(run / "renders_initial" / photograph.name, photograph.path)
+    for photograph in used[:strange]:
+        noise = np.random.default_rng(0).integers(0, 256, (84, 112, 3)).astype(np.uint8)
+        cv2.imwrite(str(photograph.path), cv2.GaussianBlur(noise, (0, 0), 2))
+    config = replace(CONFIG, fit=replace(CONFIG.fit, long=replace(CONFIG.fit.long, passes=0)))
+    progress = Quiet()
+    found = pipeline.update(copy, tmp_path / "out", config=config, initial=run / "initial.ply", progress=progress)
+    told = {p["name"]: p for p in read_json(tmp_path / "out" / "tracks.json")["photographs"]}
+    for photograph in used:
+        left_out = photograph in used[:strange]
+        assert (told[photograph.name]["status"] == "rejected") == left_out
+        assert any(f"warning: {photograph.name}: left out" in line for line in progress.lines) == left_out
+    assert not found.templates
+    silent = any("none of its photographs tells anything" in line for line in progress.lines)
+    assert silent == (strange == len(used))
+
+
 def test_shreds_are_no_shape_to_hold_against_a_known_object():
     from types import SimpleNamespace
 

@@ -15,6 +15,8 @@ from .similarity import similarity
 
 _LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise and resampling
 _LEAST_GRADIENT = 0.01  # per pixel, in 0…1: what noise makes of a flat surface
+_UNLIKE = 0.1  # dissimilarity above the expected one that no noise or blur of a fit leaves over wide areas
+_EVERYWHERE = 0.5  # share of such pixels from which on the photograph is of something else, or from somewhere else
 _COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
 
 
@@ -45,13 +47,15 @@ class ChangeMap(eqx.Module):
 
     `score` in robust standard deviations above expectation; `left` where the render shows what the photograph does not,
     −1…1: −1 where the pixel is as expected, 1 where something left, 0 where it cannot be told; `mask` the pixels that
-    changed, whichever way; `two_classes` whether there is a class of changed pixels at all (False: the mask is empty).
+    changed, whichever way; `two_classes` whether there is a class of changed pixels at all (False: the mask is empty);
+    `everywhere` whether most of the picture differs: then it tells nothing of single objects, and the rest is empty.
     """
 
     score: Float[np.ndarray, "h w"]
     left: Float[np.ndarray, "h w"]
     mask: Bool[np.ndarray, "h w"]
     two_classes: bool
+    everywhere: bool = False
 
 
 def change_map(
@@ -70,14 +74,18 @@ def change_map(
     class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, and
     that alone is proof; what came has it in the photograph, as has all that the scene never knew well.
     Descriptors reach several pixels beyond what changed: the outline is that of the colours.
+    Where most pixels are unlike what they should be, level and deviation are those of the change itself: the map is
+    empty, and says so.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
     captured = np.where(valid[..., None], captured, rendered)
     known = valid & (expected < config.unexplained)
+    nothing = np.zeros_like(expected, dtype=np.float32)
     if known.sum() < 64:
-        nothing = np.zeros_like(expected, dtype=np.float32)
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False)
     excess = 1 - similarity(rendered, captured, front_end, gamma=config.gamma) - expected
+    if np.mean(excess[known] > _UNLIKE) > _EVERYWHERE:
+        return ChangeMap(nothing, nothing, np.zeros_like(valid), False, everywhere=True)
     balance = _detail_balance(rendered, captured)
     scores, masks, thresholds = [], [], []
     colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas

@@ -58,6 +58,17 @@ class Localization:
     lenses: dict[str, CameraModel]
     photographs: tuple[PhotographStatus, ...]
 
+    def without(self, reasons: dict[str, str]) -> "Localization":
+        """The same without the cameras of some photographs, rejected for the reason given by name."""
+        return Localization(
+            {name: camera for name, camera in self.cameras.items() if name not in reasons},
+            {name: lens for name, lens in self.lenses.items() if name not in reasons},
+            tuple(
+                dataclasses.replace(p, status="rejected", reason=reasons[p.name]) if p.name in reasons else p
+                for p in self.photographs
+            ),
+        )
+
     def apply(self, capture: Capture) -> Capture:
         """The capture with the cameras that were found; given ones are the same objects as before."""
         photographs = tuple(

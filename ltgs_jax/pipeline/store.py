@@ -19,7 +19,7 @@ from ltgs_jax.io import read_bytes, write_bytes, write_json
 
 T = TypeVar("T")
 
-_FORMAT = 4  # of what stages hold: none of another format is taken up
+_FORMAT = 5  # of what stages hold: none of another format is taken up
 
 
 def digest(*parts: Any) -> str:

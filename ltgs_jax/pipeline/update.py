@@ -45,6 +45,8 @@ from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .visit import explain_visit
 
+_UNLIKE = "it differs from the scene all over: another place, another pose, or a room in which nothing stayed"
+
 
 class Progress(Protocol):
     """Where a run says how far it is."""
@@ -105,7 +107,7 @@ def update(
         for t in range(1, len(capture.visits)):
             key = digest(key, t)
             free_programs()
-            state, told = _one_visit(store, key, run, state, t, front_end, eye, progress)
+            state, told, run = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
         key = digest(key, "fit", config.fit.long)
         later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
@@ -197,13 +199,13 @@ def _observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observa
 
 
 def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
-    """Explain one visit; its state on disk."""
+    """Explain one visit; its state on disk. The run goes on without the photographs that differ all over."""
     config = run.config
 
     def compute():
         observations = _observe(run, state, t, eye, progress)
         rng = np.random.default_rng([run.seed, t])
-        after, accounts, masks = explain_visit(
+        explained = explain_visit(
             state,
             t,
             observations,
@@ -214,9 +216,10 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
             rng=rng,
             progress=progress,
         )
+        after, accounts, masks = explained.state, explained.accounts, explained.masks
         changed = float(np.mean([m.mean() for m in masks])) if masks else 0.0
         counts = {
-            "photographs": len(observations),
+            "photographs": len(masks),
             "changed_pixels": round(changed, 5),
             "objects": len(accounts),
             "templates_added": len(after.chronology.templates) - len(state.chronology.templates),
@@ -225,10 +228,17 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
             identity = after.chronology.templates[account.template].identity
             progress.note(f"{run.capture.visits[t]}: object {identity} {account.kind}")
         arrays, notes = pack_state(after)
-        return arrays, {**notes, "accounts": [a.to_json() for a in accounts], "counts": counts}
+        told = [a.to_json() for a in accounts]
+        return arrays, {**notes, "accounts": told, "unlike": explained.unlike, "counts": counts}
 
     arrays, notes = store.run(f"visit_{t:03d}", key, compute)
-    return unpack_state(arrays, notes, run.capture.visits), [Account.from_json(a) for a in notes["accounts"]]
+    for name in notes["unlike"]:
+        progress.warn(f"{name}: left out, {_UNLIKE}")
+    accounts = [Account.from_json(a) for a in notes["accounts"]]
+    run = dataclasses.replace(run, found=run.found.without(dict.fromkeys(notes["unlike"], _UNLIKE)))
+    if notes["unlike"] and not run.posed(t, "update"):
+        progress.warn(f"{run.capture.visits[t]}: none of its photographs tells anything, the scene stays as it was")
+    return unpack_state(arrays, notes, run.capture.visits), accounts, run
 
 
 def _long_fit(store: Store, key: str, run: Run, state: State, initial: Splats, later, eye: Eye, progress) -> Chronology:

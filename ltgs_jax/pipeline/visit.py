@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
@@ -33,6 +34,16 @@ from .state import (
 _LEAST_SHOWN = 6  # times the least evidence for an object, dilated outlines included, below which nothing is seen of it
 
 
+class Explained(eqx.Module):
+    """What one visit came to: the state after it, how each object was explained, the coarse change masks of the
+    photographs that were used, and the names of those that differ from the scene all over, which were not."""
+
+    state: State
+    accounts: list[Account]
+    masks: list[Bool[np.ndarray, "h w"]]
+    unlike: list[str]
+
+
 def explain_visit(
     state: State,
     t: int,
@@ -44,8 +55,8 @@ def explain_visit(
     config: Config,
     rng: np.random.Generator,
     progress,
-) -> tuple[State, list[Account], list[Bool[np.ndarray, "h w"]]]:
-    """The state after visit t, how each object was explained, and the coarse change masks.
+) -> Explained:
+    """The visit's objects, each by the cheapest account that its photographs support.
 
     `earlier` gives the photographs of a visit before, should its poses come into question.
 
@@ -57,9 +68,13 @@ def explain_visit(
     known = len(state.chronology.templates)
     scene = scene_at(state, t)
     evidence = compare(eye, scene, observations, front_end, config)
+    unlike = [o.name for o, change in zip(observations, evidence.changes, strict=True) if change.everywhere]
+    observations = [o for o in observations if o.name not in unlike]
+    if unlike:
+        evidence = compare(eye, scene, observations, front_end, config)
     coarse = evidence.masks
     if not any(mask.any() for mask in coarse):
-        return state, [], coarse
+        return Explained(state, [], coarse, unlike)
     gone: dict[int, float] = {}
     remnants: list[Remnant] = []
     # Twice: with the bulk of an object gone, what the first cut left of it stands out.
@@ -103,7 +118,8 @@ def explain_visit(
         state, t, gone, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
     state, accounts = join_states(state, t, accounts)
-    return _learn_errors(state, t, accounts, observations, front_end, eye, config), accounts, coarse
+    state = _learn_errors(state, t, accounts, observations, front_end, eye, config)
+    return Explained(state, accounts, coarse, unlike)
 
 
 def _strength(instance: Instance, evidence: Evidence) -> float:
