@@ -15,8 +15,9 @@ from .similarity import similarity
 
 _LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise and resampling
 _LEAST_GRADIENT = 0.01  # per pixel, in 0…1: what noise makes of a flat surface
-_UNLIKE = 0.1  # dissimilarity above the expected one that no noise or blur of a fit leaves over wide areas
-_EVERYWHERE = 0.5  # share of such pixels from which on the photograph is of something else, or from somewhere else
+_UNLIKE = 0.2  # dissimilarity above the expected one that no noise or blur of a fit leaves over wide areas
+_EVERYWHERE = 0.55  # share of it where there is detail, from which on the photograph is of or from somewhere else
+_WIDE = 0.25  # least share of it in the whole picture then: the only detail of a plain wall may be what changed
 _COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
 
 
@@ -74,7 +75,7 @@ def change_map(
     class of its own. In both directions, each with a deviation of its own: what left has its detail in the render, and
     that alone is proof; what came has it in the photograph, as has all that the scene never knew well.
     Descriptors reach several pixels beyond what changed: the outline is that of the colours.
-    Where most pixels are unlike what they should be, level and deviation are those of the change itself: the map is
+    Where most detail is unlike what it should be, level and deviation are those of the change itself: the map is
     empty, and says so.
     """
     # Descriptors and windows reach across the border of what counts; beyond it nothing may differ.
@@ -84,9 +85,10 @@ def change_map(
     if known.sum() < 64:
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False)
     excess = 1 - similarity(rendered, captured, front_end, gamma=config.gamma) - expected
-    if np.mean(excess[known] > _UNLIKE) > _EVERYWHERE:
+    balance, detailed = _detail_balance(rendered, captured)
+    unlike = excess > _UNLIKE
+    if unlike[known].mean() > _WIDE and unlike[known & detailed].mean() > _EVERYWHERE:
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False, everywhere=True)
-    balance = _detail_balance(rendered, captured)
     scores, masks, thresholds = [], [], []
     colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas
     for weight in (np.clip(0.5 + balance, 0, 1.25), np.clip(1 - balance, 0, 1)):
@@ -108,8 +110,9 @@ def change_map(
 
 def _detail_balance(
     rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
-) -> Float[np.ndarray, "h w"]:
-    """Whose gradients are stronger around each pixel: 1 the render's alone, −1 the photograph's alone."""
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Whose gradients are stronger around each pixel: 1 the render's alone, −1 the photograph's alone; and where they
+    are more than noise."""
 
     def energy(image):
         grey = cv2.GaussianBlur(image.mean(axis=-1).astype(np.float32), (0, 0), 1.0)
@@ -117,7 +120,7 @@ def _detail_balance(
         return cv2.GaussianBlur(gx * gx + gy * gy, (0, 0), max(image.shape[:2]) / 100)
 
     a, b = energy(rendered), energy(captured)
-    return (a - b) / (a + b + _LEAST_GRADIENT**2)
+    return (a - b) / (a + b + _LEAST_GRADIENT**2), a + b > _LEAST_GRADIENT**2
 
 
 def _standardize(
