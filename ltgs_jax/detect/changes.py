@@ -17,7 +17,7 @@ _LEAST_EXPECTED = 0.02  # dissimilarity of two photographs of one thing: noise a
 _LEAST_GRADIENT = 0.01  # per pixel, in 0…1: what noise makes of a flat surface
 _UNLIKE = 0.2  # dissimilarity above the expected one that no noise or blur of a fit leaves over wide areas
 _EVERYWHERE = 0.55  # share of it where there is detail, from which on the photograph is of or from somewhere else
-_WIDE = 0.25  # least share of it in the whole picture then: the only detail of a plain wall may be what changed
+_WIDE = 0.4  # least share of it in the whole picture then: the only detail of a plain wall may be what changed
 _COLOURLESS = 0.15  # share of a region below which the colours do not tell its outline
 
 
