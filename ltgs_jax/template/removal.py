@@ -14,6 +14,7 @@ from .support import Support, Vantage, convex_footprint, fit_support
 
 _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
+_TURNED = 0.07  # share of the evidence on what stands apart from which on it changed, be it by a turn where it stands
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
 _WIDER = 1.2  # by which the outline of the middle 90 % is widened to be that of the whole
 _FEW = 20  # splats beside what was taken down that tell how high the rest is
@@ -74,14 +75,15 @@ def taken_down(
         return told and share_of(left[upper], stayed[upper]) > off and share_of(left[~upper], stayed[~upper]) < low
 
     net = left - stayed
-    best = int(np.argmax([net[height > level].sum() - net[height <= level].sum() for level in levels]))
+    told = np.array([net[height > level].sum() - net[height <= level].sum() for level in levels])
+    best = int(np.argmax(told))
     if not parts(levels[best]):
         return None
     thick = 0.1 * np.ptp(height)
-    levels = [level for i, level in enumerate(levels) if i <= best or parts(level)]
+    # Above the best level what left would be counted with what stayed, and a round top is no step.
+    levels = [level for i, level in enumerate(levels) if i <= best or told[i] > (1 - _CLEAN) * told[best]]
     growth = [
-        _extent(points[(height > level - thick) & (height <= level)])
-        / max(_extent(points[(height > level) & (height < level + thick)]), 1e-9)
+        _extent(points[(height > level - thick) & (height <= level)]) / max(_extent(points[height > level]), 1e-9)
         for level in levels
     ]
     step = int(np.argmax(growth))
@@ -192,8 +194,8 @@ def _parts(
 ) -> list[np.ndarray]:
     """What of the `local` splats above a support left, one array of indices for each solid thing.
 
-    A thing that stands apart goes as a whole once a good part of it is seen to have changed: turned or shifted a
-    little, it still has its own colours in many places. What touches its neighbours is cut from them by a random walk,
+    A thing that stands apart goes as a whole once a small part of it is seen to have changed: turned where it stands,
+    it still has its own colours in most places. What touches its neighbours is cut from them by a random walk,
     unless only what stands `apart` is asked for.
     """
     means = np.asarray(splats.means, np.float64)
@@ -202,7 +204,7 @@ def _parts(
     for island in _islands(splats, height, local, floor, axes):
         told = share_of(left[island], stayed[island])
         alone = np.linalg.norm(np.ptp(means[island], axis=0)) < 2 * size
-        if told > config.whole and alone and left[island].sum() > 0.1 * left[body].sum():
+        if told > _TURNED and alone and left[island].sum() > 0.1 * left[body].sum():
             parts.append(island)
             rest = np.setdiff1d(rest, island)
     if not apart and len(np.intersect1d(rest, body)) >= 8:
