@@ -204,6 +204,8 @@ def test_what_shows_another_side_elsewhere_is_known_by_colours_and_shape(state, 
     joined, told = join_states(after, 2, accounts)
     assert [m.identity for m in joined.chronology.templates] == ([1, 1] if known else [1, 2])
     assert [a.kind for a in told] == ([kind] if known else [a.kind for a in accounts])
+    if not known:
+        assert told[-1].gain == 0.8  # other colours, or another shape: nothing says that it is the same
     for a, b in zip(
         jax.tree.leaves(composed(joined.chronology, 2)), jax.tree.leaves(composed(after.chronology, 2)), strict=True
     ):
@@ -228,8 +230,23 @@ def test_colours_tell_nothing_where_another_object_has_them_too(state, rival, kn
     state = add_template(state, Template(tray, 2, 0), np.zeros(90, np.float32), _FLOOR, 0)
     came = Template(transform_splats(_shifted(-0.5), stack), 3, 2)
     after = add_template(state, came, np.zeros(stack.count, np.float32), _FLOOR, 2)
-    joined, _ = join_states(after, 2, [Account(2, "added", 0.8, 0.1, 3)])
+    joined, told = join_states(after, 2, [Account(2, "added", 0.8, 0.1, 3)])
     assert [m.identity for m in joined.chronology.templates] == [1, 2, 1 if known else 3]
+    if not known:
+        assert told[0].gain == 0.8
+
+
+def test_what_comes_as_new_with_the_colours_of_what_is_gone_is_doubted_where_no_shape_tells(state):
+    for t in (1, 2, 3):
+        state = set_from(state, t, 0, visible=False)
+    state = eqx.tree_at(lambda s: s.supports, state, (None,), is_leaf=lambda x: x is state.supports)
+    stack = state.chronology.templates[0].splats
+    after = add_template(
+        state, Template(transform_splats(_shifted(-0.5), stack), 2, 2), np.zeros(stack.count, np.float32), _FLOOR, 2
+    )
+    joined, told = join_states(after, 2, [Account(1, "added", 0.8, 0.1, 3)])
+    assert [m.identity for m in joined.chronology.templates] == [1, 2]
+    assert told[0].gain < 0.1
 
 
 def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state):

@@ -21,7 +21,7 @@ APART = 0.5  # between the middles of two states, in sizes of the larger, up to 
 _FACTOR = 2.5  # between the sizes of two states of an object in one place
 _SHAPE = 1.4  # between the heights, and between the widths, of two states of an object in different places
 _COMMON = 0.55  # share of their colours that two states have in common
-_COMMON_ELSEWHERE = 0.45  # the same where their shapes agree
+_COMMON_ELSEWHERE = 0.4  # the same where their shapes agree
 _STANDS_OUT = 1.3  # times what is new has in common with any other object; where all are alike, colours tell nothing
 _BINS = 6  # of each channel
 
@@ -34,7 +34,8 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has moved, or is
     back, and shows sides that tell nothing of how it turned: its frame is that of the old template, shifted. No other
     known object may have nearly as many colours in common with it. Only something new takes part. Of several, pairs
-    with the most colours in common.
+    with the most colours in common. What stays new though it has colours of something hidden, and nothing in its shape
+    speaks against that, is less certain by their share.
     """
     templates, visible = state.chronology.templates, np.asarray(state.chronology.visible)
     shown = {m.identity for k, m in enumerate(templates) if visible[t, k]}
@@ -49,9 +50,16 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     common = shared[[known.index(k) for k in hidden]]
     others = [[templates[o].identity != templates[k].identity for o in known] for k in hidden]
     rival = np.max(np.where(np.asarray(others)[..., None], shared, 0), axis=1)
-    alike = (in_place & (common > _COMMON)) | (~in_place & elsewhere & (common > _COMMON_ELSEWHERE))
-    alike &= common > _STANDS_OUT * rival
-    replaced, again = {}, set()
+    distinct = common > _STANDS_OUT * rival
+    alike = distinct & np.where(in_place, common > _COMMON, elsewhere & (common > _COMMON_ELSEWHERE))
+    shapeless = np.array(
+        [[state.supports[k] is None or state.supports[a.template] is None for a in came] for k in hidden]
+    )
+    doubt = np.max(np.where(distinct & (in_place | elsewhere | shapeless), common, 0), axis=0)
+    replaced = {
+        a.template: dataclasses.replace(a, gain=float(a.gain * (1 - d))) for a, d in zip(came, doubt, strict=True)
+    }
+    again = set()
     for i, j in zip(*linear_sum_assignment(-np.where(alike, common, 0)), strict=True):
         old, account = hidden[i], came[j]
         identity = templates[old].identity
