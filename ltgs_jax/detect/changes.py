@@ -86,8 +86,8 @@ def change_map(
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False)
     excess = 1 - similarity(rendered, captured, front_end, gamma=config.gamma) - expected
     balance, detailed = _detail_balance(rendered, captured)
-    unlike = excess > _UNLIKE
-    if unlike[known].mean() > _WIDE and unlike[known & detailed].mean() > _EVERYWHERE:
+    unlike, detailed = known & (excess > _UNLIKE), known & detailed
+    if unlike.sum() > _WIDE * known.sum() and (unlike & detailed).sum() > _EVERYWHERE * detailed.sum():
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False, everywhere=True)
     scores, masks, thresholds = [], [], []
     colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas

@@ -64,7 +64,8 @@ def taken_down(
     `least` pixels of evidence.
 
     `points`: their centres along two axes of the support and its normal. The level is the one at which the outline
-    grows most, of those that part the evidence and those below: the foot of what was taken down tells little.
+    grows most, of the one that parts the evidence best, those nearly as good, and those below: the foot of what was
+    taken down tells little.
     """
     height = points[:, 2]
     levels = np.quantile(height, np.linspace(0.1, 0.9, 17))
