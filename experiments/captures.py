@@ -33,7 +33,9 @@ class CaptureConfig:
     dense: int = 20
     """Photographs of the first visit."""
     update: int = 3
-    """Photographs of each later visit that may be used."""
+    """Photographs of each later visit, besides the held-out."""
+    used: int | None = None
+    """How many of these may be used, spread over all; None: all. What is held out stays the same."""
     test: int = 4
     """Held-out photographs of each visit."""
     points: int = 2000
@@ -64,6 +66,8 @@ def open_capture(config: CaptureConfig, cache: Path) -> Path:
         key: getattr(config, key) for key in ("scene", "seed", "width", "height", "dense", "update", "test", "points")
     }
     make_capture(part, **options)
+    if config.used is not None:
+        _set_aside(part, config)
     if config.pose_noise > 0:
         _shake_poses(part, config)
     try:
@@ -75,7 +79,15 @@ def open_capture(config: CaptureConfig, cache: Path) -> Path:
 
 def dense_later(config: CaptureConfig, count: int) -> CaptureConfig:
     """The same rooms and visits with `count` photographs at each visit: for the bound of fitting every visit anew."""
-    return dataclasses.replace(config, update=count, pose_noise=0.0)
+    return dataclasses.replace(config, update=count, used=None, pose_noise=0.0)
+
+
+def _set_aside(folder: Path, config: CaptureConfig) -> None:
+    """Of each visit's photographs, those that may not be used, off the list of those that may."""
+    path = folder / "images" / "changes.txt"
+    names = path.read_text().split()
+    chosen = set(np.linspace(0, config.update - 1, config.used).round().astype(int).tolist())
+    path.write_text("".join(f"{name}\n" for i, name in enumerate(names) if i % config.update in chosen))
 
 
 def _shake_poses(folder: Path, config: CaptureConfig) -> None:

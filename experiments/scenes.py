@@ -151,7 +151,7 @@ def initial_scene(config: SceneConfig, problem: Problem, cache: Path) -> tuple[S
 
     The first visit is the same whatever the number of later photographs and the noise on their poses.
     """
-    capture = dataclasses.replace(config.capture, update=3, pose_noise=0.0)
+    capture = dataclasses.replace(config.capture, update=3, used=None, pose_noise=0.0)
     key = dataclasses.asdict(dataclasses.replace(config, capture=capture))
     folder = cache / "initial" / hashlib.sha256(json.dumps(key, sort_keys=True, default=str).encode()).hexdigest()[:12]
     if not (folder / "seconds.json").is_file():

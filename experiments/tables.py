@@ -10,6 +10,7 @@ rows are drawn from the table alone.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -123,21 +124,27 @@ class Options:
     """Folder of the plots; None: OUT/images."""
 
 
-def comparison_runs(
-    preset: Preset, folders: tuple[Path, ...] = (), max_side: int | None = None
-) -> dict[str, list[Run]]:
-    """Every method on every capture."""
-    built_in = [
+def _built_in(preset: Preset) -> list[SceneConfig]:
+    """The captures of a preset."""
+    return [
         vary(vary(preset.scene, "capture.scene", scene), "capture.seed", seed)
         for scene in preset.scenes
         for seed in preset.seeds
     ]
-    given = [
-        dataclasses.replace(
-            preset.scene, capture=CaptureConfig(scene=str(f)), max_side=max_side or preset.scene.max_side
-        )
-        for f in folders
+
+
+def _given(preset: Preset, options: Options) -> list[SceneConfig]:
+    """Captures in folders."""
+    side = options.max_side or preset.scene.max_side
+    return [
+        dataclasses.replace(preset.scene, capture=CaptureConfig(scene=str(folder)), max_side=side)
+        for folder in options.captures
     ]
+
+
+def comparison_runs(preset: Preset, given: list[SceneConfig]) -> dict[str, list[Run]]:
+    """Every method on every capture."""
+    built_in = _built_in(preset)
     scenes = built_in + given
     runs = {
         "ltgs": [Run(_SYSTEM, SystemConfig(scene, preset.system)) for scene in scenes],
@@ -150,17 +157,27 @@ def comparison_runs(
     return {name: runs[name] for name in dict.fromkeys(order)}
 
 
-def _variants(preset: Preset, scene: str, changes: dict[str, tuple[tuple[str, float | int | bool], ...]]):
-    base = SystemConfig(vary(preset.scene, "capture.scene", scene), preset.system)
-    return {name: [Run(_SYSTEM, dataclasses.replace(base, overrides=over))] for name, over in changes.items()}
+def _variants(
+    preset: Preset, scenes: Sequence[SceneConfig], changes: dict[str, tuple[tuple[str, float | int | bool], ...]]
+) -> dict[str, list[Run]]:
+    """This system on some captures, with some of its options changed."""
+    return {
+        name: [Run(_SYSTEM, SystemConfig(scene, preset.system, overrides)) for scene in scenes]
+        for name, overrides in changes.items()
+    }
 
 
-def _whole(preset: Preset, scene: str) -> dict[str, list[Run]]:
+def _with_photographs(scene: SceneConfig, count: int) -> SceneConfig:
+    """A capture of which so many photographs of each later visit may be used, with one and the same held out."""
+    return dataclasses.replace(scene, capture=dataclasses.replace(scene.capture, update=6, used=count))
+
+
+def _whole(preset: Preset, scene: SceneConfig) -> dict[str, list[Run]]:
     """The whole system from the first visit on at each preset that is no dearer than this page's, the photographs at
     this page's size."""
     runs, names = {}, ["tiny", "fast", "paper"]
     for name in names[: names.index(preset.system) + 1]:
-        base = vary(preset.scene, "capture.scene", scene)
+        base = scene
         if name != preset.system:
             base = dataclasses.replace(base, initial=for_small_photographs(SYSTEM_PRESETS[name]).fit.initial)
         runs[name] = [Run(_SYSTEM, SystemConfig(base, name))]
@@ -172,6 +189,7 @@ ABLATION = {
     "without known objects": (("template.tau_same", 2.0),),
     "without pose refinement": (("fit.long.fit_poses", False),),
     "without shades and shadows": (("fit.long.shade_rate", 0.0),),
+    "without ground under what left": (("template.fill_splats", 0),),
     "without background refinement": (("fit.long.background_rate", 0.0),),
     "without photographs of the first visit": (("fit.long.replay", 0.0),),
     "without the long fit": (("fit.long.passes", 0),),
@@ -185,9 +203,17 @@ PASSES = {"0 passes": (("fit.long.passes", 0),), "4 passes": QUICK, "as it is": 
 
 def sheets(preset: Preset, options: Options) -> list[Sheet]:
     """All tables, in the order in which they are worked on."""
-    scene = preset.scenes[min(1, len(preset.scenes) - 1)]
-    base = SystemConfig(vary(preset.scene, "capture.scene", scene), preset.system, QUICK)
-    views = grid(_SYSTEM, base, scene__capture__update=(2, 3, 6))
+    scene = vary(preset.scene, "capture.scene", preset.scenes[min(1, len(preset.scenes) - 1)])
+    base, given = SystemConfig(scene, preset.system, QUICK), _given(preset, options)
+    changing = [s for s in _built_in(preset) if s.capture.scene not in _STILL] + given
+    views = {
+        f"{count} photographs a visit": [
+            Run(_SYSTEM, SystemConfig(_with_photographs(s, count), preset.system, QUICK))
+            for s in changing
+            if s.capture.built_in
+        ]
+        for count in (2, 3, 4, 6)
+    }
     poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
     features = grid(_SYSTEM, base, feature_noise=(0.0, 1.0))
     depths = grid(_SYSTEM, base, depth_noise=(0.0, 0.1))
@@ -201,17 +227,17 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
         f"{name} {value}": (*QUICK, (name, value)) for name, values in HYPERPARAMETERS.items() for value in values
     }
     return [
-        Sheet("comparison", "comparison", comparison_runs(preset, options.captures, options.max_side)),
-        Sheet("ablation", "variants", _variants(preset, scene, ABLATION), own),
+        Sheet("comparison", "comparison", comparison_runs(preset, given)),
+        Sheet("ablation", "variants", _variants(preset, changing, ABLATION), own),
         Sheet("curves", "curves", curve_runs(preset.effort), chosen_points()),
         Sheet("stability", "stability", stability_runs(preset.effort)),
-        Sheet("views", "variants", {f"{r.options.scene.capture.update} photographs a visit": [r] for r in views}),
+        Sheet("views", "variants", views),
         Sheet("poses", "variants", {f"{r.options.scene.capture.pose_noise}° on given poses": [r] for r in poses}),
         Sheet("features", "variants", {f"{r.options.feature_noise} of a descriptor's norm": [r] for r in features}),
         Sheet("depths", "variants", {f"{r.options.depth_noise:.0%} of the depth": [r] for r in depths}),
         Sheet("mistakes", "variants", {name: [Run(_SYSTEM, config)] for name, config in mistakes.items()}, own),
-        Sheet("hyperparameters", "variants", _variants(preset, scene, hyper), own),
-        Sheet("passes", "variants", _variants(preset, scene, PASSES), own),
+        Sheet("hyperparameters", "variants", _variants(preset, [scene], hyper), own),
+        Sheet("passes", "variants", _variants(preset, [scene], PASSES), own),
         Sheet("presets", "variants", _whole(preset, scene), {preset.system: "this page"}),
     ]
 

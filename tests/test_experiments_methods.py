@@ -121,7 +121,7 @@ def _fake(sheet: report.Sheet) -> dict[str, dict]:
 
 def test_the_page_shows_whoever_wins_and_keeps_what_people_wrote(tmp_path):
     preset = dataclasses.replace(tables.PRESETS["tiny"], scenes=("move", "turnover"))
-    sheet = report.Sheet("comparison", "comparison", tables.comparison_runs(preset))
+    sheet = report.Sheet("comparison", "comparison", tables.comparison_runs(preset, []))
     rows = _fake(sheet)
     broken = sheet.runs["local"][1].name
     rows[broken] = {"status": "failed", "reason": "ValueError: no reason"}

@@ -144,6 +144,35 @@ def test_long_fit_finds_the_pose_and_leaves_the_rest_alone():
     np.testing.assert_allclose(fitted.world_from_template.xyz[0], off.world_from_template.xyz[0], atol=1e-7)
 
 
+def test_long_fit_stops_where_what_is_held_out_gets_worse_and_goes_back():
+    truth, _ = _moved_chronology(0.0)
+    rng, views, said = np.random.default_rng(3), [], []
+    for t in (0, 1):
+        for x in (-0.3, 0.0, 0.3):
+            view = _view(compose(truth, t), _camera(x))
+            grainy = np.clip(view.image + rng.normal(scale=60, size=view.image.shape), 0, 255).astype(np.uint8)
+            views.append(VisitView(View(view.camera, grainy, view.mask), t))
+    config = LongConfig(passes=60, rates=Rates(means=5e-3, means_final=5e-3, sh_dc=3e-2))
+    _, losses = fit_chronology(
+        truth, views, key=jax.random.key(0), config=config, progress=lambda i, n, text: said.append((n, text))
+    )
+    assert "what is held out came out best after" in said[-1][1] and len(losses) < said[0][0] / 2
+
+
+@pytest.mark.parametrize("shining", [False, True])
+def test_what_has_no_colour_that_depends_on_the_direction_gets_none(shining):
+    _, off = _moved_chronology(0.03)
+    truth = compose(off, 1)
+    views = [VisitView(_view(truth, _camera(x)), 1) for x in (-0.3, 0.3)]
+    rest = jnp.full((off.templates[0].splats.count, 3, 3), 0.1 * shining)
+    sh = jnp.concatenate([0.5 * off.templates[0].splats.sh, rest], axis=1)
+    start = eqx.tree_at(lambda c: c.templates[0].splats.sh, off, sh)
+    fitted, _ = fit_chronology(start, views, key=jax.random.key(0), config=LongConfig(passes=2))
+    after = fitted.templates[0].splats.sh
+    assert (np.asarray(after[:, 1:]) != np.asarray(rest)).any() == shining
+    assert (np.asarray(after[:, 0]) != np.asarray(sh[:, 0])).any()
+
+
 def test_long_fit_changes_nothing_far_from_what_changed():
     _, off = _moved_chronology(0.03)
     # Splats in a corner that the object never comes near, in cameras large enough for windows to leave it out.

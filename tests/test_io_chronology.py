@@ -87,6 +87,33 @@ def test_round_trip_is_exact(tmp_path, templates):
     assert description["visits"] == ["a", "IMG_0001", "ü"] and len(description["templates"]) == templates
 
 
+@pytest.mark.parametrize("precision", ["full", "half", "8-bit"])
+def test_colours_that_depend_on_no_direction_take_no_bytes(tmp_path, precision):
+    chronology = make_chronology()
+    flat = chronology.background.sh.at[8:, 1:].set(0).at[2, 1:].set(0)
+    chronology = eqx.tree_at(lambda c: c.background.sh, chronology, flat)
+    io.save_chronology(tmp_path, chronology, precision=precision)
+    arrays = safetensors.numpy.load((tmp_path / "chronology.safetensors").read_bytes())
+    assert arrays["background.sh"].shape == (11, 1, 3) and arrays["background.sh_rest"].shape == (8, 3, 3)
+    read = io.load_chronology(tmp_path)
+    assert not np.asarray(read.background.sh[8:, 1:]).any()
+    if precision == "full":
+        assert_same(chronology, read)
+
+
+def test_a_file_of_the_first_version_is_read(tmp_path):
+    chronology = make_chronology()
+    io.save_chronology(tmp_path, chronology)
+    path = tmp_path / "chronology.safetensors"
+    arrays = safetensors.numpy.load(path.read_bytes())
+    for rest in [key for key in arrays if key.endswith("sh_rest")]:
+        arrays[rest[:-5]] = np.concatenate([arrays[rest[:-5]], arrays.pop(rest)], axis=1)
+    description = (tmp_path / "chronology.json").read_text()
+    path.write_bytes(safetensors.numpy.save(arrays, {"chronology": description}))
+    rewrite(path, lambda d: d.update(version=1))
+    assert_same(chronology, io.load_chronology(tmp_path))
+
+
 def test_ground_shows_from_the_visit_that_brought_it_to_light():
     chronology = make_chronology(templates=1)
     shown = [np.isfinite(np.asarray(compose(chronology, t).logit_opacities[:11])) for t in range(3)]
@@ -142,7 +169,7 @@ def rewrite(path, change) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(version=2), "version 2"),
+        (lambda d: d.update(version=3), "version 3; this program reads versions 1 and 2"),
         (lambda d: d.update(visits=["a"]), "expected float32"),
         (lambda d: d.update(visits=["a", "../b", "c"]), r"'\.\./b' is not a name inside"),
         (lambda d: d.update(photographs=["/etc/passwd", "x"]), "is not a name inside"),

@@ -23,8 +23,8 @@ from safetensors.numpy import save_file
 from experiments.engine import vary
 from experiments.eyes import Blind, NoisyDepth
 from experiments.front_ends import Noisy
-from experiments.scenes import SceneConfig, bytes_of, initial_scene, load_problem, per_visit_answer, score
-from ltgs_jax.io import load_chronology, read_tracks
+from experiments.scenes import SceneConfig, initial_scene, load_problem, per_visit_answer, score
+from ltgs_jax.io import read_tracks
 from ltgs_jax.pipeline import PRESETS, update
 from ltgs_jax.scene import compose, drop_hidden
 
@@ -96,12 +96,11 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
         shutil.copytree(out / "stages", kept)
     said = {m["key"]: m["value"] for m in json.loads((out / "metrics.json").read_text()) if m["visit"] is None}
     scenes = [drop_hidden(compose(chronology, t)) for t in range(len(problem.visits))]
-    loaded = load_chronology(out)
     said |= {"templates": len(chronology.templates), "splats": sum(t.splats.count for t in chronology.templates)}
     said["splats"] += chronology.background.count
     events = [s for each in read_tracks(out / "tracks.json")["objects"] for s in each["states"]]
     said["confidence"] = mean(s["confidence"] for s in events if s["event"] not in ("still", "unseen"))
-    row = score(problem, per_visit_answer(scenes, bytes_of(loaded), said), folder)
+    row = score(problem, per_visit_answer(scenes, (out / "chronology.safetensors").stat().st_size, said), folder)
     return {
         **row,
         **stage_seconds(out),

@@ -33,6 +33,9 @@ from .views import StreamedView, View, plan_for, scene_extent, size_of
 from .windows import Shown, Window, window_side, windows_of, within_change
 
 _PRICE = 1e-3  # of a shadow's gain, as the slope of the loss
+_TILE = 8  # side in pixels of the squares that are held out
+_HELD_OUT = 1 / 16  # of the squares of every window of a later visit
+_PATIENCE = 0.3  # share of the passes that may, one after the other, come out no better than the best before
 
 
 @dataclass(frozen=True)
@@ -124,15 +127,17 @@ class _Variables(eqx.Module):
 
 class _Fixed(eqx.Module):
     """What stays: the ground's other splats, and since when they show; whose the variable ones are (0 the ground's,
-    1 + k template k's), since when the ground's show, and whether they belong to a template or came after the first
-    visit; shadows without their gains; the middle and diameter, of the ground and every template, that shades are
-    measured by; poses, the diameter of each pose's object, and the scene's extent."""
+    1 + k template k's), since when the ground's show, whether they belong to a template or came after the first visit,
+    and whether their colours depend on no direction, and shall not; shadows without their gains; the middle and
+    diameter, of the ground and every template, that shades are measured by; poses, the diameter of each pose's object,
+    and the scene's extent."""
 
     ground: Splats
     ground_since: Int[Array, " m"]
     owner: Int[Array, " n"]
     since: Int[Array, " n"]
     came: Bool[Array, " n"]
+    plain: Bool[Array, " n"]
     shadows: Shadows
     frames: Float[Array, "k 4"]
     placements: Placements
@@ -141,10 +146,12 @@ class _Fixed(eqx.Module):
 
 
 class _Look(eqx.Module):
-    """What an item of a step's batch looks at: a window, which of the variable splats and of the ground's show in it
-    (padded with their counts), and where among the rows of the whole batch its own lie."""
+    """What an item of a step's batch looks at: a window, which of its pixels are held out, which of the variable splats
+    and of the ground's show in it (padded with their counts), and where among the rows of the whole batch its own
+    lie."""
 
     window: Window
+    held: Bool[Array, "s s"]
     rows: Int[Array, " m"]
     ground_rows: Int[Array, " g"]
     place: Int[Array, " m"]
@@ -183,16 +190,17 @@ def _hide_padding(splats: Splats, rows, count: int) -> Splats:
 
 
 def _objective(variables: _Variables, look: _Look, fixed: _Fixed, *, config: LongConfig, plan: RenderPlan):
-    """Loss of a window with the splats of the batch's rows; beside it, what it is without the price of needles, and the
-    overflow."""
+    """Loss of a window with the splats of the batch's rows; beside it, what it is without the price of needles and the
+    mean absolute error of what is held out, and the overflow."""
     window, own = look.window, _taken(variables.splats, look.place)
     out = render(_window_splats(eqx.tree_at(lambda v: v.splats, variables, own), look, fixed), window.camera, plan=plan)
     target = window.image.astype(jnp.float32) / 255
-    loss = photometric_loss(out.image, target, window.mask, dssim=config.dssim)
+    loss = photometric_loss(out.image, target, window.mask & ~look.held, dssim=config.dssim)
+    unseen = photometric_loss(out.image, target, window.mask & look.held, dssim=0)
     needle = jax.nn.relu(jnp.ptp(own.log_scales, axis=-1) - jnp.log(8.0))
     mine = (_taken(fixed.owner, look.rows) > 0) & (look.rows < fixed.owner.shape[0])
     needles = jnp.sum(jnp.where(mine, needle, 0)) / jnp.maximum(jnp.sum(mine), 1)
-    return loss + config.anisotropy_penalty * needles, (loss, out.overflow)
+    return loss + config.anisotropy_penalty * needles, (jnp.stack([loss, unseen]), out.overflow)
 
 
 @eqx.filter_jit(donate="all-except-first")
@@ -218,6 +226,7 @@ def _step(inputs, variables: _Variables, state, config: LongConfig, plan: Render
     moves = scale_gradients(updates.splats, config.rates, fixed.extent, progress)
     colours = jnp.where(came, 1, config.background_rate)[:, None, None] * moves.sh
     moves = jax.tree.map(lambda leaf: jnp.where(came.reshape((-1,) + (1,) * (leaf.ndim - 1)), leaf, 0), moves)
+    colours = colours.at[:, 1:].multiply(~_taken(fixed.plain, rows)[:, None, None])
     moves = eqx.tree_at(lambda m: m.sh, moves, colours)
     # A pose of an object that this window does not show has no gradient, and Adam's momentum must not carry it on.
     seen = jnp.any(gradient.tangents != 0, axis=-1)
@@ -255,8 +264,9 @@ def fit_chronology(
 
     Windows of the photographs hold what templates show, and ground that a later visit brought to light (`windows_of`);
     background splats close to an object, that show hardly outside of it, may change; all others stay bit for bit.
-    Windows of visit 0 are replayed for the share `config.replay` of the steps. Returns the chronology and the loss of
-    every step; a run whose loss is not finite is stopped and the last finite state returned.
+    Windows of visit 0 are replayed for the share `config.replay` of the steps. Of the windows of later visits, squares
+    are held out: where their error has not fallen for a third of the passes, the fit ends, and goes back to where it
+    was least; so it does when a loss is not finite. Returns the chronology and the loss of every step.
 
     Raises ValueError without a photograph of a later visit.
     """
@@ -292,6 +302,8 @@ def fit_chronology(
         jnp.asarray(owner[free]),
         jnp.asarray(since[free]),
         jnp.asarray(came[free]),
+        # What the few photographs of a later visit show tells no colour that depends on the direction.
+        jnp.asarray(~every.sh[free, 1:].any(axis=(1, 2))),
         shadows,
         jnp.asarray(frames, jnp.float32),
         placements,
@@ -371,45 +383,63 @@ def _fit_windows(
         return variables, losses
     dealt = "" if config.batch == 1 else f"; {config.batch} a step, on {mesh.size} of {jax.device_count()} devices"
     progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first{dealt}")
-    looks, plan_of = _looks(windows, rows, fixed), partial(_plan, fixed=fixed)
+    looks, plan_of = _looks(windows, rows, fixed, rng), partial(_plan, fixed=fixed)
     state = adam().init(variables)
     queues: dict[bool, list[int]] = {True: [], False: []}
 
-    def draw() -> _Look:
+    def draw() -> int:
         replay = rng.random() < replayed
         queue = queues[replay]
         if not queue:
             queue.extend(rng.permutation(first if replay else later).tolist())
-        return looks[queue.pop()]
+        return queue.pop()
 
-    held = plan_of(variables, looks)
-    finite = kept = jax.tree.map(np.array, variables)
+    plan = plan_of(variables, looks)
+    best, errors, error, drawn = jax.tree.map(np.array, variables), [np.inf], 0.0, 0
     for step in range(steps):
-        if step % 100 == 0:
-            finite, kept = kept, jax.tree.map(np.array, variables)
-        batch, united = _united([draw() for _ in range(config.batch)], fixed.owner.shape[0])
+        chosen = [draw() for _ in range(config.batch)]
+        batch, united = _united([looks[i] for i in chosen], fixed.owner.shape[0])
         inputs = (fixed, batch, united, jnp.asarray(step / steps, jnp.float32))
-        variables, state, loss, overflow = _step(inputs, variables, state, config, held, mesh)
-        losses[step] = loss
+        variables, state, loss, overflow = _step(inputs, variables, state, config, plan, mesh)
+        losses[step], unseen = np.asarray(loss)
         if not np.isfinite(losses[step]):
             progress(step, steps, "the loss is not finite: stopped at the last good state")
-            return finite, losses[:step]
+            return best, losses[:step]
         if int(overflow) > 0:
-            held = plan_of(variables, looks)
+            plan = plan_of(variables, looks)
         if step % 100 == 0 or step == steps - 1:
             progress(step + 1, steps, f"loss {losses[max(0, step - 100) : step + 1].mean():.4f}")
+        error, drawn = error + config.batch * float(unseen), drawn + sum(windows[i].visit > 0 for i in chosen)
+        if drawn < len(later):
+            continue
+        errors.append(error / drawn)
+        error, drawn = 0.0, 0
+        if errors[-1] == min(errors):
+            best = jax.tree.map(np.array, variables)
+        elif len(errors) - 1 - int(np.argmin(errors)) >= _PATIENCE * config.passes:
+            text = f"what is held out came out best after {int(np.argmin(errors))} passes: stopped, and back to it"
+            progress(step, steps, text)
+            return best, losses[: step + 1]
     return variables, losses
 
 
-def _looks(windows: Sequence[Window], rows, fixed: _Fixed) -> list[_Look]:
-    """Each window by itself, on the host, all of one shape and its visit traced, so that one program serves all."""
+def _held_out(side: int, rng: np.random.Generator) -> Bool[np.ndarray, "s s"]:
+    """Squares of a window that nothing is fitted to."""
+    tiles = rng.random((-(-side // _TILE),) * 2) < _HELD_OUT
+    return tiles.repeat(_TILE, axis=0).repeat(_TILE, axis=1)[:side, :side]
+
+
+def _looks(windows: Sequence[Window], rows, fixed: _Fixed, rng: np.random.Generator) -> list[_Look]:
+    """Each window by itself, on the host, all of one shape and its visit traced, so that one program serves all; of
+    those of later visits, squares are held out."""
     counts = (fixed.owner.shape[0], fixed.ground.count)
     lengths = [max(256, -(-max(len(pair[kind]) for pair in rows) // 256) * 256) for kind in (0, 1)]
     looks = []
     for window, pair in zip(windows, rows, strict=True):
         own, ground = (_padded(r, length, count) for r, length, count in zip(pair, lengths, counts, strict=True))
         window = eqx.tree_at(lambda w: (w.visit, w.rows), window, (np.asarray(window.visit), None))
-        looks.append(_Look(jax.tree.map(np.asarray, window), own, ground, np.arange(len(own), dtype=np.int32)))
+        held = _held_out(len(window.mask), rng) & (window.visit > 0)
+        looks.append(_Look(jax.tree.map(np.asarray, window), held, own, ground, np.arange(len(own), dtype=np.int32)))
     return looks
 
 

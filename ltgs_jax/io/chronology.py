@@ -20,7 +20,8 @@ from .files import InputError, read_bytes, safe_name, write_bytes, write_json
 
 M = TypeVar("M", bound=eqx.Module)
 
-_VERSION = 1
+_VERSION = 2
+_READ = (1, 2)  # version 1 has all coefficients of every splat in `sh`
 _DTYPES = ("float32", "float64")
 _VISITS = ("uint8", "uint16", "uint32", "int32")
 PRECISIONS = ("full", "half", "8-bit")
@@ -68,10 +69,8 @@ def save_chronology(folder: str | Path, chronology: Chronology, *, precision: st
     parts = {"background": chronology.background}
     parts |= {f"templates.{k}": template.splats for k, template in enumerate(chronology.templates)}
     for name, splats in parts.items():
-        means, *others = arrays_of(name, splats).items()
-        arrays |= dict([means])
-        for key, array in others:
-            arrays |= _stored(key, array, precision)
+        for key, array in _lean(name, splats).items():
+            arrays |= {key: array} if key == f"{name}.means" else _stored(key, array, precision)
     description = {
         "version": _VERSION,
         "visits": list(chronology.visits),
@@ -86,6 +85,17 @@ def save_chronology(folder: str | Path, chronology: Chronology, *, precision: st
     metadata = {"chronology": json.dumps(description)}
     write_bytes(folder / "chronology.safetensors", safetensors.numpy.save(content, metadata))
     write_json(folder / "chronology.json", description)
+
+
+def _lean(name: str, splats: Splats) -> dict[str, np.ndarray]:
+    """The arrays of splats, with colours that depend on the direction only up to the last splat that has any."""
+    arrays = arrays_of(name, splats)
+    sh = arrays[f"{name}.sh"]
+    if sh.shape[1] == 1:
+        return arrays
+    arrays[f"{name}.sh"], rest = sh[:, :1], sh[:, 1:]
+    shining = np.flatnonzero(rest.any(axis=(1, 2)))
+    return arrays | {f"{name}.sh_rest": rest[: shining[-1] + 1 if len(shining) else 0]}
 
 
 def _stored(key: str, array: np.ndarray, precision: str) -> dict[str, np.ndarray]:
@@ -166,8 +176,9 @@ def _describe(content: bytes, path: Path) -> dict:
         )
     except (KeyError, TypeError, ValueError, RecursionError):
         raise InputError(f"{path}: does not describe a chronology") from None
-    if version != _VERSION:
-        raise InputError(f"{path}: is of version {version}; this program reads version {_VERSION}")
+    if version not in _READ:
+        known = " and ".join(map(str, _READ))
+        raise InputError(f"{path}: is of version {version}; this program reads versions {known}")
     if not sound or not description["visits"]:
         raise InputError(f"{path}: does not describe a chronology")
     return description
@@ -197,11 +208,20 @@ class _Taker:
 
     def splats(self, name: str, n: int) -> Splats:
         """The splats under a name, any SH degree."""
-        k = self._arrays[f"{name}.sh"].shape[1:2] if f"{name}.sh" in self._arrays else ()
-        if k and math.isqrt(k[0]) ** 2 != k[0]:
-            raise InputError(f"{self._path}: {name}.sh has {k[0]} coefficients")
-        shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *k, 3))
-        return Splats(*(self._restored(key, shape) for key, shape in zip(_keys(name, Splats), shapes, strict=True)))
+        shapes = ((n, 3), (n, 4), (n, 3), (n,), (n, *self._found(f"{name}.sh", 1), 3))
+        arrays = [self._restored(key, shape) for key, shape in zip(_keys(name, Splats), shapes, strict=True)]
+        if (key := f"{name}.sh_rest") in self._arrays:
+            rest = self._restored(key, (*self._found(key, 0), *self._found(key, 1), 3))
+            if len(rest) > n:
+                raise InputError(f"{self._path}: {key} has {len(rest)} rows for {n} splats")
+            arrays[-1] = jnp.concatenate([arrays[-1], jnp.pad(rest, ((0, n - len(rest)), (0, 0), (0, 0)))], axis=1)
+        if math.isqrt(k := arrays[-1].shape[1]) ** 2 != k:
+            raise InputError(f"{self._path}: {name}.sh has {k} coefficients")
+        return Splats(*arrays)
+
+    def _found(self, key: str, axis: int) -> tuple[int, ...]:
+        """The length that an array has along an axis, if it has one."""
+        return self._arrays[key].shape[axis : axis + 1] if key in self._arrays else ()
 
     def _restored(self, key: str, shape: tuple[int, ...]):
         """What `_stored` stored."""

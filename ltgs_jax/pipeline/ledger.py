@@ -65,7 +65,7 @@ def _without(chronology: Chronology, accounts: Sequence[Account], t: int) -> lis
         template = chronology.templates[k]
         numbers = _POSE if kind == "moved" else 0
         if template.source_visit == t:
-            numbers += _numbers(template.splats, template.splats.count)
+            numbers += _numbers(template.splats)
         before = jax.tree.map(np.copy, (poses, visible))
         for leaf in jax.tree.leaves(before):
             leaf[t, k] = leaf[t - 1, k]
@@ -74,7 +74,7 @@ def _without(chronology: Chronology, accounts: Sequence[Account], t: int) -> lis
     if chronology.since is not None and (late := np.asarray(chronology.since) == t).any():
         logits = np.where(late, -np.inf, np.asarray(chronology.background.logit_opacities))
         other = eqx.tree_at(lambda c: c.background.logit_opacities, chronology, logits)
-        found.append(("ground", _numbers(chronology.background, int(late.sum())), other))
+        found.append(("ground", _numbers(chronology.background[late]), other))
     if (dark := _unlit(chronology, t)) is not None:
         found.append(("light and shadows", *dark))
     return found
@@ -97,9 +97,12 @@ def _unlit(chronology: Chronology, t: int) -> tuple[int, Chronology] | None:
     return (numbers, chronology) if numbers else None
 
 
-def _numbers(splats: Splats, count: int) -> int:
-    """Parameters of so many of these splats."""
-    return count * sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(splats))
+def _numbers(splats: Splats) -> int:
+    """Parameters of splats; colours that depend on the direction count where there are any, as on disk."""
+    rest = np.asarray(splats.sh)[:, 1:]
+    shining, more = int(rest.any(axis=(1, 2)).sum()), int(np.prod(rest.shape[1:]))
+    each = sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(splats))
+    return splats.count * (each - more) + shining * more
 
 
 def squared_error(scene: Splats, views: Sequence[VisitView], eye: Eye) -> float:

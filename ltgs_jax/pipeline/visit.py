@@ -68,10 +68,10 @@ def explain_visit(
     known = len(state.chronology.templates)
     scene = scene_at(state, t)
     evidence = compare(eye, scene, observations, front_end, config)
-    unlike = [o.name for o, change in zip(observations, evidence.changes, strict=True) if change.everywhere]
-    observations = [o for o in observations if o.name not in unlike]
-    if unlike:
-        evidence = compare(eye, scene, observations, front_end, config)
+    kept = [i for i, change in enumerate(evidence.changes) if not change.everywhere]
+    unlike = [o.name for i, o in enumerate(observations) if i not in kept]
+    observations = [observations[i] for i in kept]
+    evidence = Evidence(tuple(evidence.looks[i] for i in kept), tuple(evidence.changes[i] for i in kept))
     coarse = evidence.masks
     if not any(mask.any() for mask in coarse):
         return Explained(state, [], coarse, unlike)

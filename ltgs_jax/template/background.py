@@ -161,7 +161,7 @@ def fill_under(
     around = np.linalg.norm(local[:, :2] - middle, axis=1) < 1.5 * size
     on_plane = around & (np.abs(support.height(means)) < 4 * support.noise + 0.02 * size)
     on_plane &= np.asarray(background.opacities) > 0.05
-    if on_plane.sum() < 8:
+    if on_plane.sum() < 8 or config.fill_splats == 0:
         return background[np.zeros(background.count, bool)]
     ring = local[on_plane, :2]
     colors = np.clip(np.asarray(background.sh)[on_plane, 0] * C0 + 0.5, 0, 1)

@@ -16,7 +16,7 @@ class TemplateConfig:
     cut_color: float = 0.5
     """Colour difference, in 0…1, at which two near splats are hardly taken to be of one object."""
     fill_splats: int = 2500
-    """Most splats laid where an object's removal bares the surface below."""
+    """Most splats laid where an object's removal bares the surface below; 0: none are."""
     hull_resolution: int = 40
     """Voxels along the longest edge of a new object's visual hull."""
     new_splats: int = 2048
