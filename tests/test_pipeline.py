@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_capture import write_tiny_capture
 
 from ltgs_jax import pipeline
 from ltgs_jax.demo import make_capture
@@ -130,6 +131,24 @@ def test_a_second_run_resumes_and_changes_nothing(run, capture):
     assert "initial: taken from disk" in progress.lines
     assert "fit: taken from disk" in progress.lines
     assert (run / "chronology.safetensors").read_bytes() == before
+
+
+def test_a_visit_that_comes_later_leaves_the_earlier_as_they_are_and_ends_as_all_at_once(tmp_path):
+    capture, aside = write_tiny_capture(tmp_path / "capture", again=True), tmp_path / "t2"
+    (capture / "images" / "t2").rename(aside)
+    pipeline.update(capture, tmp_path / "grown", config=CONFIG, progress=Quiet())
+    known = read_tracks(tmp_path / "grown" / "tracks.json")["objects"]
+    aside.rename(capture / "images" / "t2")
+    progress = Quiet()
+    pipeline.update(capture, tmp_path / "grown", config=CONFIG, progress=progress)
+    assert {"initial: taken from disk", "visit_001: taken from disk"} <= set(progress.lines)
+    assert "visit_002: taken from disk" not in progress.lines and "fit: taken from disk" not in progress.lines
+    objects = read_tracks(tmp_path / "grown" / "tracks.json")["objects"]
+    assert [[state["event"] for state in item["states"]] for item in known] == [["moved"]]
+    assert [state["event"] for state in objects[0]["states"]] == ["moved", "moved"]
+    pipeline.update(capture, tmp_path / "at_once", config=CONFIG, progress=Quiet())
+    grown, at_once = (tmp_path / name / "chronology.safetensors" for name in ("grown", "at_once"))
+    assert grown.read_bytes() == at_once.read_bytes()
 
 
 def test_a_stage_cut_short_is_done_again_with_the_same_result(run, capture, tmp_path):

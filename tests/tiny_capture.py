@@ -50,18 +50,24 @@ def _camera(turn: float, height: float = 1.3) -> Camera:
     return Camera(SE3.from_matrix(jnp.asarray(matrix, jnp.float32)), K, WIDTH, HEIGHT)
 
 
-def write_tiny_capture(folder: Path, *, moved: bool = True, seed: int = 0) -> Path:
-    """Two visits of a table with a box that has moved (or not); 6 and 3 photographs, all posed; initial.ply is true."""
+def write_tiny_capture(folder: Path, *, moved: bool = True, again: bool = False, seed: int = 0) -> Path:
+    """Two visits of a table with a box that has moved (or not), three where it then moves `again`; 6 photographs, then
+    3 each, all posed; initial.ply is true."""
     rng = np.random.default_rng(seed)
     table = _table(rng)
-    box = np.random.default_rng(seed + 1)
-    before = concatenate_splats([table, _box(box, (-0.35, 0.0))])
-    box = np.random.default_rng(seed + 1)
-    after = concatenate_splats([table, _box(box, (0.4, 0.2))]) if moved else before
+
+    def with_box(*at: float) -> Splats:
+        return concatenate_splats([table, _box(np.random.default_rng(seed + 1), at)])
+
+    before = with_box(-0.35, 0.0)
+    after = with_box(0.4, 0.2) if moved else before
+    visits = [("t0", before, np.arange(6) * 1.05), ("t1", after, np.arange(3) * 2.1 + 0.4)]
+    if again:
+        visits.append(("t2", with_box(-0.1, -0.4), np.arange(3) * 2.1 + 0.9))
     lens = CameraModel("PINHOLE", WIDTH, HEIGHT, (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2))
     images = {}
     none = np.zeros(0, np.int64)
-    for visit, scene, turns in (("t0", before, np.arange(6) * 1.05), ("t1", after, np.arange(3) * 2.1 + 0.4)):
+    for visit, scene, turns in visits:
         for i, turn in enumerate(turns):
             camera = _camera(float(turn))
             noisy = np.asarray(render(scene, camera).image) + rng.normal(0, 0.01, (HEIGHT, WIDTH, 3))

@@ -21,7 +21,7 @@ from .files import InputError, read_bytes, safe_name, write_bytes, write_json
 M = TypeVar("M", bound=eqx.Module)
 
 _VERSION = 2
-_READ = (1, 2)  # version 1 has all coefficients of every splat in `sh`
+_READ = (1, 2)  # version 1 has all coefficients of every splat in `sh`, and `since` of each
 _DTYPES = ("float32", "float64")
 _VISITS = ("uint8", "uint16", "uint32", "int32")
 PRECISIONS = ("full", "half", "8-bit")
@@ -60,8 +60,7 @@ def save_chronology(folder: str | Path, chronology: Chronology, *, precision: st
         "exposure": chronology.exposure,
     }
     if chronology.since is not None:
-        since = np.asarray(chronology.since)
-        arrays["background.since"] = since.astype(np.min_scalar_type(since.max(initial=0)))
+        arrays["background.since_runs"] = _runs(np.asarray(chronology.since))
     if chronology.shade is not None:
         arrays["shade"] = chronology.shade
     if chronology.shadows is not None:
@@ -85,6 +84,12 @@ def save_chronology(folder: str | Path, chronology: Chronology, *, precision: st
     metadata = {"chronology": json.dumps(description)}
     write_bytes(folder / "chronology.safetensors", safetensors.numpy.save(content, metadata))
     write_json(folder / "chronology.json", description)
+
+
+def _runs(values: np.ndarray) -> np.ndarray:
+    """Values [n] as runs [r 2] of one value each, and its length."""
+    starts = np.flatnonzero(np.diff(values, prepend=-1))
+    return np.stack([values[starts], np.diff(starts, append=len(values))], axis=1).astype(np.int32)
 
 
 def _lean(name: str, splats: Splats) -> dict[str, np.ndarray]:
@@ -139,7 +144,7 @@ def load_chronology(folder: str | Path) -> Chronology:
         exposure=take("exposure", (p, 3, 2)),
         visits=visits,
         photographs=photographs,
-        since=take("background.since", (n,), dtypes=_VISITS).astype(np.int32) if "background.since" in arrays else None,
+        since=take.since(n),
         shade=take("shade", (t, k, 4)) if "shade" in arrays else None,
         shadows=take.shadows(t) if "shadows.cast" in arrays else None,
     )
@@ -230,6 +235,17 @@ class _Taker:
             low, high = self(f"{key}.range", (2, *shape[1:]), dtypes=("float32",))
             return low + array * ((high - low) / 255)
         return array.astype(jnp.float32) if array.dtype == jnp.float16 else array
+
+    def since(self, n: int):
+        """The visit from which on each of n splats shows, if there is such an array."""
+        if (key := "background.since") in self._arrays:
+            return self(key, (n,), dtypes=_VISITS).astype(np.int32)
+        if (key := "background.since_runs") not in self._arrays:
+            return None
+        values, lengths = np.asarray(self(key, (*self._found(key, 0), 2), dtypes=_VISITS)).T
+        if (lengths < 0).any() or lengths.sum() != n:
+            raise InputError(f"{self._path}: {key} is not for {n} splats")
+        return jnp.asarray(np.repeat(values, lengths).astype(np.int32))
 
     def shadows(self, t: int) -> Shadows:
         """The shadows of t visits."""

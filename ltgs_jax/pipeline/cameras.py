@@ -30,10 +30,18 @@ class Run:
         """Of every photograph that has one, by name."""
         return self.found.cameras
 
-    def poses(self) -> list[str | Float[np.ndarray, "4 4"]]:
-        """Names and poses of all cameras, by which a stage tells others from them."""
-        named = sorted(self.cameras.items())
-        return [part for name, camera in named for part in (name, np.asarray(camera.cam_from_world.as_matrix()))]
+    def poses(self, visit: int) -> list[str | Float[np.ndarray, "..."]]:
+        """Names, poses and K of a visit's cameras, by which a stage tells others from them."""
+        named = [
+            (p.name, self.cameras[p.name])
+            for p in self.capture.photographs
+            if p.visit == visit and p.name in self.cameras
+        ]
+        return [
+            part
+            for name, camera in named
+            for part in (name, np.asarray(camera.cam_from_world.as_matrix()), np.asarray(camera.K))
+        ]
 
     def posed(self, visit: int, role: str) -> list[Photograph]:
         """Photographs of a visit and role whose camera is known."""

@@ -13,7 +13,7 @@ from .ledger import squared_error
 from .looks import Eye, on_host
 from .state import State, composed, cut_background, cut_template, extend_background
 
-_PRICE = 2e-3  # growth of the squared error over all later photographs for which the splats that show least may go
+_PRICE = 6e-3  # growth of the squared error over all later photographs for which the splats that show least may go
 _FEW = 8  # splats that a template must keep
 _HALVINGS = 6  # of the number of splats in question
 

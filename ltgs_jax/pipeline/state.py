@@ -274,7 +274,7 @@ def pack_state(state: State) -> tuple[dict[str, np.ndarray], dict]:
 
 
 def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, ...]) -> State:
-    """The state that `pack_state` named."""
+    """The state that `pack_state` named, at as many visits as there are now: later ones are like the last it knew."""
     templates, errors, supports = [], [], []
     for k, (identity, source) in enumerate(notes["templates"]):
         templates.append(Template(module_of(Splats, f"template{k}", arrays), identity, source))
@@ -283,10 +283,9 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
         supports.append(None if packed is None else Support(packed[:3], float(packed[3]), float(packed[4])))
     start = State.of_initial(module_of(Splats, "background", arrays), arrays["errors"], visits)
     start = eqx.tree_at(lambda s: (s.guessed, s.chronology.since), start, (arrays["guessed"], arrays["since"]))
-    poses = SE3(jnp.asarray(arrays["quat"]), jnp.asarray(arrays["xyz"]))
-    state = _with_templates(
-        start, tuple(templates), poses, jnp.asarray(arrays["visible"]), tuple(errors), tuple(supports)
-    )
+    known = np.minimum(np.arange(len(visits)), len(arrays["visible"]) - 1)
+    quat, xyz, visible = (jnp.asarray(arrays[name][known]) for name in ("quat", "xyz", "visible"))
+    state = _with_templates(start, tuple(templates), SE3(quat, xyz), visible, tuple(errors), tuple(supports))
     shadows = module_of(Shadows, "shadows", arrays) if "shadows.cast" in arrays else None
     lit = (arrays.get("shade"), shadows)
     return eqx.tree_at(lambda s: (s.chronology.shade, s.chronology.shadows), state, lit, is_leaf=_is_none)

@@ -17,6 +17,7 @@ from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
 from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
 from ltgs_jax.io import (
+    Capture,
     InputError,
     Photograph,
     arrays_of,
@@ -91,21 +92,25 @@ def update(
         write_json(out / "env.json", _environment())
         say_outlook(look_ahead(capture, config, None if scene is None else scene.count), progress)
         store = Store(out, progress)
-        # The key of a stage holds the options it reads and the key of the stage before: an option of a later stage
-        # leaves the earlier ones as they are.
-        files = [(p.name, p.path.stat().st_size, p.path.stat().st_mtime_ns) for p in capture.photographs]
+        # The key of a stage holds what it reads and the key of the stage before: an option of a later stage leaves the
+        # earlier ones as they are, and so does a visit that comes later.
+        visits = range(len(capture.visits))
+        files = [_files(capture, t) for t in visits]
         key = digest(config.io, config.localize, config.render, seed, files)
         run = locate_photographs(store, key, capture, config, seed, progress)
         brought = read_bytes(given) if given is not None else None
-        key = digest(key, *run.poses(), config.fit.initial, config.detect.gamma, brought)
+        poses, points = [run.poses(t) for t in visits], (capture.points, capture.point_colors)
+        options = (config.io, config.render, config.fit.initial, config.detect.gamma)
+        first = digest(*options, seed, files[0], *poses[0], *points, brought)
         eye = eye or Eye()
-        splats, errors = _initial_scene(store, key, run, scene, front_end, eye, progress)
+        splats, errors = _initial_scene(store, first, run, scene, front_end, eye, progress)
+        key = digest(key, first, *(part for each in poses for part in each))
         run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
         state = State.of_initial(splats, errors, capture.visits)
         accounts: list[list[Account]] = [[]]
-        key = digest(key, *run.poses(), config.detect, config.match, config.template, config.register)
-        for t in range(1, len(capture.visits)):
-            key = digest(key, t)
+        key = digest(first, config.detect, config.match, config.template, config.register)
+        for t in visits[1:]:
+            key = digest(key, t, files[t], *run.poses(t))
             free_programs()
             state, told, run = _one_visit(store, key, run, state, t, front_end, eye, progress)
             accounts.append(told)
@@ -116,6 +121,15 @@ def update(
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
+
+
+def _files(capture: Capture, visit: int) -> list[tuple]:
+    """What tells the photographs of a visit, and their masks, from others."""
+
+    def stamp(path: Path | None) -> tuple[int, int] | None:
+        return None if path is None else (path.stat().st_size, path.stat().st_mtime_ns)
+
+    return [(p.name, p.role, stamp(p.path), stamp(p.mask_path)) for p in capture.photographs if p.visit == visit]
 
 
 def load_view(run: Run, photograph: Photograph) -> View:
