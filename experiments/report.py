@@ -120,11 +120,11 @@ def _comparison(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
 
 
 def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
-    """One row per variant of this system."""
+    """One row per variant that all captures are there of."""
     named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
-    named = {name: found for name, found in named.items() if found}
+    named = {name: found for name, found in named.items() if len(found) == len(sheet.runs[name])}
     labels = {run.options.scene.capture.scene for runs in sheet.runs.values() for run in runs}
-    text = f"Capture: {', '.join(sorted(labels))}.\n\n" + table(
+    text = f"Means over {', '.join(sorted(labels))}.\n\n" + table(
         ["variant", *(c.title for c in COLUMNS)], _cells(named, COLUMNS, named)
     )
     points = [

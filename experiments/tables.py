@@ -167,6 +167,16 @@ def _variants(
     }
 
 
+def _at_more_steps(preset: Preset, scene: SceneConfig) -> dict[str, list[Run]]:
+    """This system beside a fit of every visit anew, with as many steps for each first scene, and four times those."""
+    runs = {}
+    for steps in (scene.initial.steps, 4 * scene.initial.steps):
+        longer = vary(scene, "initial.steps", steps)
+        runs[f"ltgs, {steps} steps"] = [Run(_SYSTEM, SystemConfig(longer, preset.system))]
+        runs[f"3dgs-dense, {steps} steps"] = [Run(METHODS["3dgs-dense"], MethodConfig(longer, preset.steps))]
+    return runs
+
+
 def _with_photographs(scene: SceneConfig, count: int) -> SceneConfig:
     """A capture of which so many photographs of each later visit may be used, with one and the same held out."""
     return dataclasses.replace(scene, capture=dataclasses.replace(scene.capture, update=6, used=count))
@@ -229,6 +239,7 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     return [
         Sheet("comparison", "comparison", comparison_runs(preset, given)),
         Sheet("ablation", "variants", _variants(preset, changing, ABLATION), own),
+        Sheet("steps", "variants", _at_more_steps(preset, scene)),
         Sheet("curves", "curves", curve_runs(preset.effort), chosen_points()),
         Sheet("stability", "stability", stability_runs(preset.effort)),
         Sheet("views", "variants", views),
