@@ -216,14 +216,10 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     scene = vary(preset.scene, "capture.scene", preset.scenes[min(1, len(preset.scenes) - 1)])
     base, given = SystemConfig(scene, preset.system, QUICK), _given(preset, options)
     changing = [s for s in _built_in(preset) if s.capture.scene not in _STILL] + given
-    views = {
-        f"{count} photographs a visit": [
-            Run(_SYSTEM, SystemConfig(_with_photographs(s, count), preset.system, QUICK))
-            for s in changing
-            if s.capture.built_in
-        ]
-        for count in (2, 3, 4, 6)
-    }
+    views: dict[str, list[Run]] = {}
+    for count in (2, 3, 4, 6):
+        scenes = [_with_photographs(s, count) for s in changing if s.capture.built_in]
+        views |= _variants(preset, scenes, {f"{count} photographs a visit": QUICK})
     poses = grid(_SYSTEM, base, scene__capture__pose_noise=(0.0, 0.3, 1.0))
     features = grid(_SYSTEM, base, feature_noise=(0.0, 1.0))
     depths = grid(_SYSTEM, base, depth_noise=(0.0, 0.1))

@@ -416,8 +416,8 @@ def _fit_windows(
         error, drawn = 0.0, 0
         if errors[-1] == min(errors):
             best = jax.tree.map(np.array, variables)
-        elif len(errors) - 1 - int(np.argmin(errors)) >= _PATIENCE * config.passes:
-            text = f"what is held out came out best after {int(np.argmin(errors))} passes: stopped, and back to it"
+        elif len(errors) - 1 - (least := int(np.argmin(errors))) >= _PATIENCE * config.passes:
+            text = f"what is held out came out best after {least} passes: stopped, and back to it"
             progress(step, steps, text)
             return best, losses[: step + 1]
     return variables, losses

@@ -17,5 +17,7 @@ def photometric_loss(
     image = jnp.where(inside, image, target)
     count = jnp.maximum(jnp.sum(mask), 1)
     l1 = jnp.sum(jnp.abs(image - target)) / (3 * count)
+    if dssim == 0:
+        return l1
     structure = jnp.sum(jnp.where(inside, 1 - ssim_map(image, target), 0)) / (3 * count)
     return (1 - dssim) * l1 + dssim * structure
