@@ -122,6 +122,8 @@ def test_the_ledger_says_what_each_thing_cost_and_bought(run):
     for row in rows:
         if row["what"].endswith("moved"):
             assert row["parameters"] == 7  # a pose and nothing else
+            assert row["evidence"] in ("search", "matches")
+    assert all(row["evidence"] is None for row in rows if row["what"].endswith(("removed", "ground", "shadows")))
 
 
 def test_a_second_run_resumes_and_changes_nothing(run, capture):

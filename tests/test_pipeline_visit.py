@@ -184,6 +184,17 @@ def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_
         assert _track(again.chronology, 1, every)["states"][2]["event"] == "new_state"
 
 
+def test_what_has_the_place_colours_and_shape_of_what_left_and_fits_none_of_its_poses_is_another_thing(state):
+    gone = set_from(state, 2, 0, visible=False)
+    stack = state.chronology.templates[0].splats
+    came = Template(transform_splats(_shifted(0.6), stack), 2, 2)
+    after = add_template(gone, came, np.zeros(stack.count, np.float32), _FLOOR, 2)
+    after, told = join_states(after, 2, [Account(0, "removed", 0.6, 0.1, 3), Account(1, "added", 0.8, 0.1, 3)])
+    assert [m.identity for m in after.chronology.templates] == [1, 2]
+    assert [a.kind for a in told] == ["removed", "added"]
+    assert told[1].gain < 0.1  # and is doubted
+
+
 @pytest.mark.parametrize(
     ("color", "height", "known"),
     [((0.5, 0.5, 0.5), 0.2, True), ((0.9, 0.2, 0.1), 0.2, False), ((0.5, 0.5, 0.5), 0.07, False)],

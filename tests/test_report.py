@@ -97,7 +97,10 @@ def chronology(tmp_path):
          "counts": {"masks": 4}, "resumed": False}
         for name, seconds in (("detect", 12.5), ("fit", 61.0))
     ]  # fmt: skip
-    bought = {"visit": VISITS[1], "what": "object 1 moved", "parameters": 7, "bytes": 28, "gain_db": 3.25}
+    bought = {
+        "visit": VISITS[1], "what": "object 1 moved", "parameters": 7, "bytes": 28, "gain_db": 3.25,
+        "evidence": "matches",
+    }  # fmt: skip
     stages.append({"stage": "ledger", "status": "done", "counts": {"ledger": [bought]}})
     for name, value in {
         "tracks": tracks, "metrics": rows, "stages": stages, "report": {"photographs": photographs},
@@ -171,6 +174,7 @@ def test_the_page_says_what_each_visit_added_and_bought(chronology):
     page = write_report(chronology).read_text()
     text, _ = _read(page)
     assert "object 1 moved" in text and "3.250" in text and "dB bought" in text
+    assert "Poses of known objects: 1 by matches." in text
     assert '<th class="number">KiB</th>' in page and "<th>seconds</th>" in page  # beside the seconds a bar is drawn
     (chronology / "stages.json").write_text(json.dumps([{"stage": "ledger", "counts": {"ledger": 7}}]))
     text, _ = _read(write_report(chronology).read_text())

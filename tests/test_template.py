@@ -22,7 +22,7 @@ from ltgs_jax.template import (
     search_template,
     settle_template,
 )
-from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, thin, tilts_of
+from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, shown_points, thin, tilts_of
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.locate import freedoms_of, relit
@@ -326,6 +326,18 @@ def test_a_template_is_found_where_it_stands_now():
     assert placement.overlap > 0.8
     assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(3)
     assert float(jnp.linalg.norm(placement.world_from_template.xyz - truth.xyz)) < 0.03 * 0.42
+    assert placement.evidence == "search"
+    # Where the search begins elsewhere it finds nothing, and follows what other evidence proposes, roughly, as its own.
+    elsewhere = np.array([[1.1, -0.9, 0.15]])
+    rough = SE3(truth.quat, truth.xyz + jnp.asarray([0.02, -0.015, 0.01])) @ SE3.exp(
+        jnp.asarray([0, 0, 0, 0.1, 0, 0.1])
+    )
+    options = {"size": 0.42, "refiner": Refiner(), "rng": rng, "config": config}
+    lost = search_template(template, support, support, elsewhere, crop, **options)
+    told = search_template(template, support, support, elsewhere, crop, matched={"matches": rough}, **options)
+    assert lost.best_gain < 0.2 and lost.evidence == ("search", "search")
+    placement = settle_template(told, crop, size=0.42, refiner=Refiner())
+    assert placement.evidence == "matches" and placement.gain > 0.8
 
 
 def _turned(angle: float, xyz) -> SE3:
@@ -424,9 +436,10 @@ def test_a_pose_out_of_sight_is_no_better_than_one_in_sight():
     _, covered = refiner.score(wrong, poses, crop, tolerance=0.04)
     options = {"normal": support.normal, "size": 0.42, "tolerance": 0.04}
     for least, out_of_sight in ((0.0, True), (0.5 * covered.max(), False)):
-        found = refiner.slide(wrong, poses, crop, least=least, rng=np.random.default_rng(0), **options)
+        found, origins = refiner.slide(wrong, poses, crop, least=least, rng=np.random.default_rng(0), **options)
         _, cover = refiner.images(wrong, found, crop, 0.04)
         assert np.any(np.sum(cover, axis=(1, 2, 3)) < 0.2 * covered.max()) == out_of_sight
+        assert len(origins) == found.xyz.shape[0] and origins.max() < poses.xyz.shape[0]
 
 
 def test_photographs_agree_on_the_surface_and_not_before_or_behind_it():
@@ -460,17 +473,17 @@ def test_what_leans_a_little_is_stood_upright_at_its_height():
     table = Support(np.asarray([0.0, 0, 1]), 0.0, 1e-3)
     nearly = Support(np.asarray([0.0, np.sin(0.03), np.cos(0.03)]), 0.01, 1e-3)  # the same table, badly seen
     thinned = thin(box, 300)  # ends in invisible splats at the origin, which say nothing of where the box is
-    poses = SE3.identity((1,), jnp.float32)
-    search = Search(thinned, table, nearly, poses, np.zeros(1), 1.0, 1.0)
+    points = shown_points(thinned)
     middle = np.r_[middle_of(np.asarray(box.means, np.float64)), 1]
     for degrees in (0.0, 5.0, -12.0):
         turn = Rotation.from_euler("zx", [40, degrees], degrees=True).as_matrix()
         leaning = np.eye(4)
         leaning[:3, :3] = turn
         leaning[:3, 3] = [0.3, -0.2, 0.02]
-        level = np.asarray(levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), search).as_matrix(), np.float64)
+        upright = levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), points, table, nearly)
+        level = np.asarray(upright.as_matrix(), np.float64)
         np.testing.assert_allclose(level[:3, :3] @ [0, 0, 1], [0, 0, 1], atol=1e-6)
         np.testing.assert_allclose((level @ middle)[:2], (leaning @ middle)[:2], atol=1e-6)
         np.testing.assert_allclose((level @ middle)[2], middle[2], atol=1e-6)
     leaning[:3, :3] = Rotation.from_euler("x", 60, degrees=True).as_matrix()
-    assert levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), search) is None
+    assert levelled(SE3.from_matrix(jnp.asarray(leaning, jnp.float32)), points, table, nearly) is None

@@ -13,6 +13,7 @@ alone; the seconds in the row are those that the stages took when they ran.
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from statistics import mean
@@ -100,6 +101,7 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     said["splats"] += chronology.background.count
     events = [s for each in read_tracks(out / "tracks.json")["objects"] for s in each["states"]]
     said["confidence"] = mean(s["confidence"] for s in events if s["event"] not in ("still", "unseen"))
+    said |= {f"poses_by_{kind}": float(count) for kind, count in winners(out).items()}
     row = score(problem, per_visit_answer(scenes, (out / "chronology.safetensors").stat().st_size, said), folder)
     return {
         **row,
@@ -132,6 +134,12 @@ def _read_stage(path: Path):
     """A stage's file, open, and its notes."""
     content = safe_open(path, "numpy")
     return content, json.loads(content.metadata()["notes"])
+
+
+def winners(out: Path) -> Counter[str]:
+    """How many poses of known objects each kind of evidence proposed, by the ledger of a chronology."""
+    stages = {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
+    return Counter(row["evidence"] for row in stages["ledger"]["counts"]["ledger"] if row["evidence"])
 
 
 def stage_seconds(out: Path) -> dict[str, float]:

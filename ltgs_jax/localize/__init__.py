@@ -4,6 +4,7 @@ from .align import Alignment as Alignment
 from .align import RenderView as RenderView
 from .align import align_photograph as align_photograph
 from .align import correct_pose as correct_pose
+from .object_pose import object_pose as object_pose
 from .place import localize as localize
 from .renders import align_later as align_later
 from .structure import Structure as Structure

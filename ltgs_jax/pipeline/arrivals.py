@@ -34,6 +34,7 @@ from ltgs_jax.template import (
 from .config import Config
 from .ground import ground_shade, light_alone
 from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
+from .matched import SIDE, Matcher
 from .state import (
     Account,
     State,
@@ -62,13 +63,14 @@ _LOW = 0.1  # height, in diameters of a new object, under which what mends the s
 
 
 class Arrival(eqx.Module):
-    """Something that came: its volume and outlines, the surface below, windows around it, the share of it that may
-    be ground that nobody saw before, since it was guessed, or something stood there and left, and the gain on the
-    colours that were there, if that is all."""
+    """Something that came: its volume and outlines, the surface below, windows around it, as poses are compared in and
+    as they are matched in, the share of it that may be ground that nobody saw before, since it was guessed, or
+    something stood there and left, and the gain on the colours that were there, if that is all."""
 
     instance: Instance
     support: Support
     crop: Crop
+    window: Crop
     bared: float
     light: float | None
 
@@ -106,8 +108,13 @@ def place_arrivals(
     did show what left. `surface`: points of the known scene.
     """
     tools = {"config": config, "rng": rng, "progress": progress}
-    arrivals = _arrivals_of(instances, t, observations, evidence, bared, surface, **tools)
-    state, accounts, known, rest = _place_known(state, t, gone, arrivals, observations, evidence, eye=eye, **tools)
+
+    def arrivals_of(instances: Sequence[Instance], evidence: Evidence) -> list[Arrival]:
+        return _arrivals_of(instances, t, observations, evidence, bared, surface, **tools)
+
+    placing = {"eye": eye, **tools}
+    arrivals = arrivals_of(instances, evidence)
+    state, accounts, known, rest = _place_known(state, t, gone, arrivals, observations, evidence, front_end, **placing)
     beside = _beside(state, t, known, observations, evidence, eye=eye, config=config)
     if any(region.any() for region in beside):
         after = compare(eye, scene_at(state, t), observations, front_end, config)
@@ -116,8 +123,8 @@ def place_arrivals(
             for o, r, m, look in zip(observations, beside, after.masks, after.looks, strict=True)
         ]
         found = [instance for instance in find_instances(cones, surface, config=config.match) if instance.views > 1]
-        more = _arrivals_of(found, t, observations, after, bared, surface, **tools)
-        state, added, _, others = _place_known(state, t, gone, more, observations, after, eye=eye, **tools)
+        more = arrivals_of(found, after)
+        state, added, _, others = _place_known(state, t, gone, more, observations, after, front_end, **placing)
         accounts, rest = accounts + added, rest + others
     for arrival, new in rest:
         after, account = _add_new(state, t, arrival, new, config, progress)
@@ -143,10 +150,10 @@ def _arrivals_of(
             continue
         share = sum((r & b).sum() for r, b in zip(instance.regions, bared, strict=True))
         share /= max(sum(r.sum() for r in instance.regions), 1)
-        crop = crop_around(instance, observations, evidence, config)
+        crop, window = (crop_around(instance, observations, evidence, s) for s in (config.template.window, SIDE))
         changed = [r & m & o.valid for r, m, o in zip(instance.regions, evidence.masks, observations, strict=True)]
         light = light_alone([o.image for o in observations], [look.image for look in evidence.looks], changed)
-        arrivals.append(Arrival(instance, support, crop, float(share), light))
+        arrivals.append(Arrival(instance, support, crop, window, float(share), light))
     return arrivals
 
 
@@ -157,6 +164,7 @@ def _place_known(
     arrivals: Sequence[Arrival],
     observations: Sequence[Observation],
     evidence: Evidence,
+    front_end: FrontEnd,
     *,
     eye: Eye,
     config: Config,
@@ -165,7 +173,7 @@ def _place_known(
 ) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[tuple[Arrival, NewObject | None]]]:
     """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest, each
     as something new."""
-    placements = _placements(state, t, arrivals, eye=eye, config=config, rng=rng, progress=progress)
+    placements = _placements(state, t, arrivals, front_end, eye=eye, config=config, rng=rng, progress=progress)
 
     @cache
     def as_new(i: int) -> NewObject | None:
@@ -241,8 +249,8 @@ def _window(instance: Instance, observations) -> list[tuple[float, float, float]
     return boxes
 
 
-def crop_around(instance: Instance, observations, evidence: Evidence, config: Config) -> Crop:
-    """Windows of the photographs around an instance, in which other changes do not count."""
+def crop_around(instance: Instance, observations, evidence: Evidence, size: int) -> Crop:
+    """Windows of the photographs around an instance, `size` pixels wide, in which other changes do not count."""
     regions = [dilate(region, 2) for region in instance.regions]
     return make_crop(
         [o.camera for o in observations],
@@ -256,19 +264,20 @@ def crop_around(instance: Instance, observations, evidence: Evidence, config: Co
         ],
         [region & o.valid for o, region in zip(observations, regions, strict=True)],
         _window(instance, observations),
-        size=config.template.window,
+        size=size,
     )
 
 
 def _placements(
-    state: State, t: int, arrivals: Sequence[Arrival], *, eye: Eye, config: Config, rng, progress
+    state: State, t: int, arrivals: Sequence[Arrival], front_end: FrontEnd, *, eye: Eye, config: Config, rng, progress
 ) -> dict[tuple[int, int], Placement]:
-    """Where each hidden template would stand as each arrival: the best few by a search, then settled."""
+    """Where each hidden template would stand as each arrival: the best few by search and matches, then settled."""
     placements = {}
+    matcher = Matcher(state, front_end, config)
     hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
     sizes = {k: template_diameter(state.chronology.templates[k].splats) for k in hidden}
     for i, arrival in enumerate(arrivals):
-        searches = _searches(state, t, arrival, sizes, eye=eye, config=config, rng=rng)
+        searches = _searches(state, t, arrival, sizes, matcher, eye=eye, config=config, rng=rng)
         ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
         least = config.template.tau_gain
         for k in ranked:
@@ -283,16 +292,17 @@ def _placements(
             identity = state.chronology.templates[k].identity
             progress.note(
                 f"visit {t}: arrival {i} as object {identity}: explains {found.gain:.2f}, "
-                f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}"
+                f"outline {found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, "
+                f"by {found.evidence}"
             )
     return placements
 
 
 def _searches(
-    state: State, t: int, arrival: Arrival, sizes: dict[int, float], *, eye: Eye, config: Config, rng
+    state: State, t: int, arrival: Arrival, sizes: dict[int, float], matcher: Matcher, *, eye: Eye, config: Config, rng
 ) -> dict[int, Search]:
-    """Poses of the templates that have room in an arrival: upright, and, where none explains it so, on their other
-    sides."""
+    """Poses of the templates that have room in an arrival: upright, or as what matches says, and, where none explains
+    it so, on their other sides."""
 
     def search(k: int, upright: bool) -> Search:
         return search_template(
@@ -306,6 +316,7 @@ def _searches(
             rng=rng,
             before=state.chronology.world_from_template[t - 1, k] if upright else None,
             upright=upright,
+            matched=matcher.poses(k, arrival.window, arrival.instance) if upright else {},
             config=config.template,
         )
 

@@ -16,6 +16,7 @@ from ltgs_jax.template import middle_of, place_template, search_template, settle
 from .arrivals import convincing, crop_around
 from .config import Config
 from .looks import Evidence, Eye, Observation, compare, unlike_where_different
+from .matched import SIDE, Matcher
 from .state import Account, State, came_to_place, scene_at, set_from
 
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
@@ -45,6 +46,7 @@ def turn_in_place(
     (`earlier`) like the pose found now as well, which is theirs from that visit on.
     """
     accounts, stood = [], []
+    matcher = Matcher(state, front_end, config)
     for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
         support, template = state.supports[k], state.chronology.templates[k]
         if support is None:
@@ -62,11 +64,13 @@ def turn_in_place(
         if views == 0:
             continue
         points = np.asarray(before.apply(jnp.asarray(template.splats.means)), np.float64)
-        crop = crop_around(Instance(points, tuple(regions), views), observations, without, config)
+        instance = Instance(points, tuple(regions), views)
+        crop, window = (crop_around(instance, observations, without, s) for s in (config.template.window, SIDE))
         size = template_diameter(template.splats)
         search = search_template(
             template, support, support.moved(before), middle_of(points)[None], crop,
-            size=size, refiner=eye.refiner, rng=rng, before=before, config=config.template,
+            size=size, refiner=eye.refiner, rng=rng, before=before, matched=matcher.poses(k, window, instance),
+            config=config.template,
         )  # fmt: skip
         if search.best_gain < config.template.tau_gain:
             continue

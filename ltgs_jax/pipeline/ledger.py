@@ -24,12 +24,13 @@ def make_ledger(
     progress: Callable[[int, int, str], None] = lambda i, n, text: None,
 ) -> list[dict]:
     """A row for each account, and for the ground and the light of each visit: {"visit", "what", "parameters", "bytes",
-    "gain_db"}.
+    "gain_db", "evidence"}.
 
     Parameters are those that came with that visit, 4 bytes each. The gain is the PSNR over all of the visit's
     photographs, whole, less that of the same scene without the one thing: an object where and as it was at the visit
     before, ground or light left out. They are the photographs that the fit saw: a gain of nothing says that the
-    addition was not worth its bytes, a high one not that it is right.
+    addition was not worth its bytes, a high one not that it is right. The evidence is what proposed the pose of a known
+    object, None elsewhere.
     """
     rows = []
     names = chronology.visits
@@ -40,7 +41,7 @@ def make_ledger(
         if not seen or not without:
             continue
         whole = squared_error(drop_hidden(composed(chronology, t)), seen, eye)
-        for what, numbers, other in without:
+        for what, numbers, other, evidence in without:
             gain = 10 * np.log10(
                 max(squared_error(drop_hidden(composed(other, t)), seen, eye), 1e-12) / max(whole, 1e-12)
             )
@@ -51,17 +52,22 @@ def make_ledger(
                     "parameters": numbers,
                     "bytes": 4 * numbers,
                     "gain_db": round(float(gain), 3),
+                    "evidence": evidence,
                 }
             )
     return rows
 
 
-def _without(chronology: Chronology, accounts: Sequence[Account], t: int) -> list[tuple[str, int, Chronology]]:
-    """What visit t added: in words, how many numbers it takes, and the chronology without it."""
+def _without(
+    chronology: Chronology, accounts: Sequence[Account], t: int
+) -> list[tuple[str, int, Chronology, str | None]]:
+    """What visit t added: in words, how many numbers it takes, the chronology without it, and what proposed its
+    pose."""
     found = []
     poses, visible = jax.tree.map(np.array, (chronology.world_from_template, chronology.visible))
     for k in sorted({a.template for a in accounts}):
-        kind = next(a.kind for a in accounts if a.template == k)
+        account = next(a for a in accounts if a.template == k)
+        kind = account.kind
         template = chronology.templates[k]
         numbers = _POSE if kind == "moved" else 0
         if template.source_visit == t:
@@ -70,13 +76,13 @@ def _without(chronology: Chronology, accounts: Sequence[Account], t: int) -> lis
         for leaf in jax.tree.leaves(before):
             leaf[t, k] = leaf[t - 1, k]
         other = eqx.tree_at(lambda c: (c.world_from_template, c.visible), chronology, before)
-        found.append((f"object {template.identity} {kind}", numbers, other))
+        found.append((f"object {template.identity} {kind}", numbers, other, account.evidence))
     if chronology.since is not None and (late := np.asarray(chronology.since) == t).any():
         logits = np.where(late, -np.inf, np.asarray(chronology.background.logit_opacities))
         other = eqx.tree_at(lambda c: c.background.logit_opacities, chronology, logits)
-        found.append(("ground", _numbers(chronology.background[late]), other))
+        found.append(("ground", _numbers(chronology.background[late]), other, None))
     if (dark := _unlit(chronology, t)) is not None:
-        found.append(("light and shadows", *dark))
+        found.append(("light and shadows", *dark, None))
     return found
 
 

@@ -30,12 +30,12 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     """What visit t's accounts call added, where it is an object that does not show any more: the new template gets the
     identity of the old one, and one account in place of two.
 
-    In the place of what left at this visit, and of its colours, it is a new state (section 3.2 of the LTGS paper:
-    changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has moved, or is
-    back, and shows sides that tell nothing of how it turned: its frame is that of the old template, shifted. No other
-    known object may have nearly as many colours in common with it. Only something new takes part. Of several, pairs
-    with the most colours in common. What stays new though it has colours of something hidden, and nothing in its shape
-    speaks against that, is less certain by their share.
+    In the place of what left at this visit, of its colours and another shape, it is a new state (section 3.2 of the
+    LTGS paper: changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has
+    moved, or is back, and shows sides that tell nothing of how it turned: its frame is that of the old template,
+    shifted. No other known object may have nearly as many colours in common with it. Only something new takes part. Of
+    several, pairs with the most colours in common. What stays new though it has colours of something hidden, and
+    nothing in its shape speaks against that, is less certain by their share.
     """
     templates, visible = state.chronology.templates, np.asarray(state.chronology.visible)
     shown = {m.identity for k, m in enumerate(templates) if visible[t, k]}
@@ -44,18 +44,19 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     if not hidden or not came:
         return state, list(accounts)
     in_place = np.array([[_in_place(state, t, k, a.template) for a in came] for k in hidden])
-    elsewhere = np.array([[_of_one_shape(state, k, a.template) for a in came] for k in hidden])
+    one_shape = np.array([[_of_one_shape(state, k, a.template) for a in came] for k in hidden])
     known = [k for k in range(len(templates)) if k not in {a.template for a in came}]
     shared = np.array([[_in_common(state, k, a.template) for a in came] for k in known])
     common = shared[[known.index(k) for k in hidden]]
     others = [[templates[o].identity != templates[k].identity for o in known] for k in hidden]
     rival = np.max(np.where(np.asarray(others)[..., None], shared, 0), axis=1)
     distinct = common > _STANDS_OUT * rival
-    alike = distinct & np.where(in_place, common > _COMMON, elsewhere & (common > _COMMON_ELSEWHERE))
+    # What has not changed its shape, and stands in its place, some pose of the old template explains.
+    alike = distinct & np.where(in_place, ~one_shape & (common > _COMMON), one_shape & (common > _COMMON_ELSEWHERE))
     shapeless = np.array(
         [[state.supports[k] is None or state.supports[a.template] is None for a in came] for k in hidden]
     )
-    doubt = np.max(np.where(distinct & (in_place | elsewhere | shapeless), common, 0), axis=0)
+    doubt = np.max(np.where(distinct & (in_place | one_shape | shapeless), common, 0), axis=0)
     replaced = {
         a.template: dataclasses.replace(a, gain=float(a.gain * (1 - d))) for a, d in zip(came, doubt, strict=True)
     }

@@ -38,7 +38,8 @@ class State(eqx.Module):
 
 class Account(eqx.Module):
     """How one object was explained at one visit: kind, share of the change explained, what is left unlike the
-    photographs, over how many photographs, and the axis [3] in its template's frame about which its turn is unknown."""
+    photographs, over how many photographs, the axis [3] in its template's frame about which its turn is unknown, and
+    the evidence that proposed its pose, if one was sought."""
 
     template: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -46,12 +47,13 @@ class Account(eqx.Module):
     residual: float = eqx.field(static=True)
     views: int = eqx.field(static=True)
     ambiguous_axis: tuple[float, ...] | None = eqx.field(static=True, default=None)
+    evidence: str | None = eqx.field(static=True, default=None)
 
     @classmethod
     def of_placed(cls, template: int, kind: str, found: Placement, views: int) -> "Account":
         """Of a template that was found again."""
         axis = None if found.ambiguous_axis is None else tuple(map(float, found.ambiguous_axis))
-        return cls(template, kind, found.gain, found.error, views, axis)
+        return cls(template, kind, found.gain, found.error, views, axis, found.evidence)
 
     @classmethod
     def from_json(cls, entry: dict) -> "Account":
@@ -68,6 +70,7 @@ class Account(eqx.Module):
             "residual": float(self.residual),
             "views": self.views,
             "ambiguous_axis": self.ambiguous_axis,
+            "evidence": self.evidence,
         }
 
 

@@ -1,6 +1,7 @@
 """One self-contained page of results: no other file, no network."""
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
@@ -189,7 +190,7 @@ def _ledger(stages: Sequence[dict]) -> str:
     rows = [row for row in listed if isinstance(row, dict)] if isinstance(listed, list) else []
     if not rows:
         return ""
-    heads = ["visit", "what", "numbers added", "KiB", "dB bought"]
+    heads = ["visit", "what", "numbers added", "KiB", "dB bought", "pose by"]
     body = [
         [
             str(row.get("visit", "")),
@@ -197,13 +198,17 @@ def _ledger(stages: Sequence[dict]) -> str:
             row.get("parameters"),
             None if (size := _number(row.get("bytes"))) is None else _Cell(f"{size / 1024:.1f}", size),
             _number(row.get("gain_db")),
+            str(row.get("evidence") or ""),
         ]
         for row in rows
     ]
+    kinds = Counter(str(row["evidence"]) for row in rows if row.get("evidence"))
+    won = ", ".join(f"{count} by {kind}" for kind, count in kinds.most_common())
     words = (
         "dB: PSNR over the photographs of the visit, whole, less that without this one thing (an object as it was at "
         "the visit before). They are the photographs that it was fitted to."
     )
+    words += f" Poses of known objects: {escape(won)}." if won else ""
     return f'<p class="soft">{words}</p>{_table(heads, body)}'
 
 

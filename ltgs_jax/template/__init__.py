@@ -24,6 +24,9 @@ from .removal import gone_evidence as gone_evidence
 from .removal import share_of as share_of
 from .removal import taken_down as taken_down
 from .removal import with_foot as with_foot
+from .sides import Sides as Sides
+from .sides import points_of_depth as points_of_depth
+from .sides import render_sides as render_sides
 from .support import Support as Support
 from .support import Vantage as Vantage
 from .support import fit_support as fit_support

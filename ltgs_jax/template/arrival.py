@@ -1,6 +1,8 @@
 """Something came: a known template at a new pose, or a new object built from its outlines and photographs."""
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -41,14 +43,15 @@ _LEVEL_APART = 0.3  # in heights of the object: surfaces nearer to each other th
 _LEANS = np.radians(20)  # from the normal, beyond which something lies on another side
 _LEVEL_MARGIN = 0.03  # by which it may look worse upright and still be taken to stand so
 _ALIKE = 0.5  # share of what a pose explains that every other turn must explain for the turn to be unknown
+SEARCH = "search"  # the evidence for a pose: renders at many poses, compared with the photographs
 _AGREE = 0.06  # difference of colours at which two photographs hardly show one surface
 
 
 class Placement(eqx.Module):
     """A template found again: its pose, the mean unlikeness with it, the share of the change it explains, the share of
     its outlines that nothing speaks against, its structural likeness to the photographs, the share of what changed
-    clearly that its outlines cover, its outlines in the windows, and the axis in the template's frame about which any
-    turn explains the change as well (None: one does better than others)."""
+    clearly that its outlines cover, its outlines in the windows, the axis in the template's frame about which any turn
+    explains the change as well (None: one does better than others), and the evidence that proposed the pose."""
 
     world_from_template: SE3
     error: float
@@ -58,6 +61,7 @@ class Placement(eqx.Module):
     recall: float
     outlines: Bool[np.ndarray, "v s s"]
     ambiguous_axis: Float[np.ndarray, "3"] | None = None
+    evidence: str = eqx.field(static=True, default=SEARCH)
 
     @property
     def worth(self) -> float:
@@ -146,7 +150,7 @@ def thin(splats: Splats, most: int) -> Splats:
 
 class Search(eqx.Module):
     """Promising poses of a template, from one surface to another, and the mean unlikeness with it at each; the error
-    `without` it, and the part of that which is to be explained."""
+    `without` it, the part of that which is to be explained, and the evidence that proposed each pose."""
 
     template: Splats
     stood_on: Support
@@ -155,6 +159,7 @@ class Search(eqx.Module):
     errors: Float[np.ndarray, " m"]
     without: float
     change: float
+    evidence: tuple[str, ...] = eqx.field(static=True, default=(SEARCH,))
 
     @property
     def best_gain(self) -> float:
@@ -174,18 +179,20 @@ def search_template(
     rng: np.random.Generator,
     before: SE3 | None = None,
     upright: bool = True,
+    matched: Mapping[str, SE3] = MappingProxyType({}),
     config: TemplateConfig = TemplateConfig(),
 ) -> Search:
     """Poses at which a template, rendered at many turns and places on the support, looks like the photographs.
 
-    Upright, and at its pose `before`; or, if not `upright`, on its other sides. The best two, best first.
+    Upright, and at its pose `before`; or, if not `upright`, on its other sides. The best two, best first, of these and
+    of the poses that other evidence proposes (`matched`, by its name), which the search follows as it does its own.
 
     Coarse windows tell the right one of a template's poses, and not one template from another: at half the size even a
     box where it stands may explain nothing, and what is full of detail explains nothing a few degrees beside its pose.
     What the best two explain is measured in the windows themselves, after some steps of descent.
     """
     light, lighter = (thin(template.splats, count) for count in (config.search_splats, config.search_splats // 2))
-    points = _shown_points(light)
+    points = shown_points(light)
     coarse = half_crop(crop)
     without, change = backdrop_error(crop)
     options = {"tolerance": 0.1 * size}
@@ -198,14 +205,19 @@ def search_template(
     least = _IN_SIGHT * np.median(covered)
     scores = np.where(covered < least, np.inf, scores)
     chosen = _unlike(hypotheses, scores, config.starts, distance=0.3 * size, angle=0.4)
-    poses = refiner.slide(
-        lighter, hypotheses[chosen], coarse, normal=stands_on.normal, size=size, least=least, rng=rng, **options
+    given = [levelled(pose, points, stood_on, stands_on) or pose for pose in matched.values()]
+    starts = hypotheses[chosen[: config.starts - len(given)]]
+    starts = jax.tree.map(lambda leaf, *more: jnp.concatenate([*(m[None] for m in more), leaf]), starts, *given)
+    names = (*matched, *[SEARCH] * config.starts)
+    poses, origins = refiner.slide(
+        lighter, starts, coarse, normal=stands_on.normal, size=size, least=least, rng=rng, **options
     )
     errors, _ = refiner.score(light, poses, crop, **options)
-    two = poses[np.argsort(errors, kind="stable")[:2]]
-    near = refiner.refine(light, two, crop, size=size, steps=6, blurred=3, **options)
+    two = np.argsort(errors, kind="stable")[:2]
+    near = refiner.refine(light, poses[two], crop, size=size, steps=6, blurred=3, **options)
     order = np.argsort(near.errors, kind="stable")
-    return Search(light, stood_on, stands_on, near.poses[order], near.errors[order], without, change)
+    evidence = tuple(names[i] for i in origins[two[order]])
+    return Search(light, stood_on, stands_on, near.poses[order], near.errors[order], without, change, evidence)
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
@@ -215,21 +227,24 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     stays where it is when an object turns. It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
     found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=0.1 * size, steps=12, blurred=3)
-    first = found.poses[int(np.argmin(found.errors))]
+    best = int(np.argmin(found.errors))
+    first, evidence = found.poses[best], search.evidence[best]
     turned = _other_turns(search, first, crop, size=size, refiner=refiner)
     half = _ROUNDS // 2
     poses = [_polished(search, pose, None, crop, size, refiner, half)[0] for pose in (first, turned[0], turned[1])]
     lit = [place_template(search, pose, crop, size=size, refiner=refiner, lit=True) for pose in poses]
-    chosen = poses[max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))]
+    likeliest = max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))
+    chosen, evidence = poses[likeliest], evidence if likeliest == 0 else SEARCH
     chosen, _ = _polished(search, chosen, None, crop, size, refiner, _ROUNDS - half, width=_FINER)
     best = place_template(search, chosen, crop, size=size, refiner=refiner)
-    upright = levelled(best.world_from_template, search)
+    points = shown_points(search.template)
+    upright = levelled(best.world_from_template, points, search.stood_on, search.stands_on)
     if upright is not None:
         pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
         if error <= best.error * (1 + _LEVEL_MARGIN):
             best = place_template(search, pose, crop, size=size, refiner=refiner)
     axis = search.stood_on.normal if _looks_alike(search, best.world_from_template, crop, size, refiner) else None
-    return eqx.tree_at(lambda p: p.ambiguous_axis, best, axis, is_leaf=lambda leaf: leaf is None)
+    return dataclasses.replace(best, ambiguous_axis=axis, evidence=evidence)
 
 
 def _looks_alike(search: Search, pose: SE3, crop: Crop, size: float, refiner: Refiner) -> bool:
@@ -273,20 +288,19 @@ def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner:
     return fitted.poses[1 + np.argsort(np.where(dips, least, least + 1)[1:], kind="stable")[:2]]
 
 
-def _shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:
+def shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:
     """Centres of the splats that show: a thinned template ends in ones that do not."""
     return np.asarray(splats.means, np.float64)[np.asarray(splats.opacities) > 0.1]
 
 
-def levelled(pose: SE3, search: Search) -> SE3 | None:
-    """A pose with what it leans turned back, as high above the surface as it stood; None where it leans far, on another
-    side.
+def levelled(pose: SE3, points: Float[np.ndarray, "n 3"], stood: Support, stands: Support) -> SE3 | None:
+    """A pose of a template's points with what it leans turned back, as high above the surface as it stood; None where
+    it leans far, on another side.
 
     Two surfaces that agree at its new place but for a little are one: the difference is that of their estimates.
     """
     matrix = np.asarray(pose.as_matrix(), np.float64)
-    stood, stands = search.stood_on, search.stands_on
-    before = middle_of(_shown_points(search.template))
+    before = middle_of(points)
     middle = matrix[:3, :3] @ before + matrix[:3, 3]
     height = stood.height(before[None])[0]
     apart = abs(stood.height(middle[None])[0] - stands.height(middle[None])[0])

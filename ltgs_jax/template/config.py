@@ -33,6 +33,10 @@ class TemplateConfig:
     """Turns about the support's normal tried for a known template."""
     starts: int = 32
     """Poses, unlike each other, that are followed further, fewer from round to round."""
+    matches: bool = True
+    """Whether matches of a known template's renders with the photographs propose a pose, beside the search."""
+    registration: bool = False
+    """Whether registration of its surface with that of what came proposes one; to compile it takes most of a minute."""
     window: int = 56
     """Pixels along the edge of the windows in which poses are compared."""
     candidates: int = 2

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
 
 from ltgs_jax.geometry import SE3, Camera, stack_cameras
@@ -389,18 +389,20 @@ class Refiner:
         tolerance: float,
         least: float,
         rng: np.random.Generator,
-    ) -> SE3:
+    ) -> tuple[SE3, Int[np.ndarray, " k"]]:
         """Each of m poses, best first, moved over the surface of unit `normal` and turned about it, to where it is
         least unlike the photographs: in every round of `_BEAM` the best of random steps around each, steps shrinking,
-        and fewer poses followed. Where the template covers fewer than `least` pixels nothing can be said of a pose.
+        and fewer poses followed; and which of the m each comes from. Where the template covers fewer than `least`
+        pixels nothing can be said of a pose.
 
         Two in-plane shifts and a turn: the other three freedoms would let a wrong pose sink or tilt to please.
         """
         center = np.asarray(_middle(template).xyz, np.float64)
         axes = np.linalg.svd(normal[None])[2][1:]
         best = np.asarray(poses.as_matrix(), np.float64)
+        origins = np.arange(len(best))
         for r, (kept, tries) in enumerate(_BEAM):
-            best = best[:kept]
+            best, origins = best[:kept], origins[:kept]
             steps = rng.normal(size=(len(best), tries, 3)) * np.array([0.25 * size, 0.25 * size, 0.35]) * 0.65**r
             steps[:, 0] = 0
             trial = np.stack(
@@ -413,8 +415,8 @@ class Refiner:
             errors, covered = self.score(template, flat, crop, tolerance=tolerance)
             errors = np.where(covered < least, np.inf, errors).reshape(trial.shape[:2])
             order = np.argsort(errors.min(axis=1), kind="stable")
-            best = trial[order, errors.argmin(axis=1)[order]]
-        return SE3.from_matrix(jnp.asarray(best, jnp.float32))
+            best, origins = trial[order, errors.argmin(axis=1)[order]], origins[order]
+        return SE3.from_matrix(jnp.asarray(best, jnp.float32)), origins
 
     def refine(
         self,

@@ -1,8 +1,12 @@
 """Objects of the present scene that the photographs of a visit no longer show."""
 
+import itertools
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ltgs_jax.geometry import C0
@@ -16,6 +20,7 @@ _LEAST_VOTES = 0.3  # pixels (αT) from which on a photograph sees a splat
 _MOST_VOTES = 3.0  # pixels beyond which one photograph's word on a splat weighs no more
 _TURNED = 0.07  # share of the evidence on what stands apart from which on it changed, be it by a turn where it stands
 _OFF = 0.7  # share of the evidence on what was taken down which must say that it left
+_ALIKE = 0.15  # difference of the middle colours, in 0…1, up to which two parts that touch are one thing
 _WIDER = 1.2  # by which the outline of the middle 90 % is widened to be that of the whole
 _FEW = 20  # splats beside what was taken down that tell how high the rest is
 _CLEAN = 0.1  # share of the evidence that speaks against a level, up to which it needs no step there
@@ -213,7 +218,25 @@ def _parts(
         # Capped, so that a splat that straddles the outline goes with its neighbours.
         probability = random_walk(graph, np.minimum(left[rest], 2), np.minimum(stayed[rest], 2))
         parts += _groups(means, rest[probability > 0.5])
-    return [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+    parts = [part for part in parts if left[part].sum() > 0.1 * left[body].sum()]
+    return _joined(parts, means, colors, left, stayed)
+
+
+def _joined(parts: list[np.ndarray], means, colors, left, stayed) -> list[np.ndarray]:
+    """Parts with those that touch them, have their colours and left as clearly: the rim of a pan stands apart from its
+    handle where a few splats of its bottom are low."""
+    link = np.eye(len(parts), dtype=bool)
+    trees = [cKDTree(means[part]) for part in parts]
+    reach = [3 * np.median(tree.query(tree.data, k=min(4, tree.n))[0][:, -1]) for tree in trees]
+    for i, j in itertools.combinations(range(len(parts)), 2):
+        touch = trees[i].query(means[parts[j]])[0].min() < min(reach[i], reach[j])
+        apart = np.linalg.norm(np.median(colors[parts[i]], axis=0) - np.median(colors[parts[j]], axis=0))
+        both = min(share_of(left[part], stayed[part]) for part in (parts[i], parts[j]))
+        link[i, j] = touch and apart < _ALIKE and both > _OFF
+    labels = connected_components(csr_array(link), directed=False)[1]
+    return [
+        np.concatenate([p for p, label in zip(parts, labels, strict=True) if label == i]) for i in np.unique(labels)
+    ]
 
 
 def _above(members: Int[np.ndarray, " m"], height, noise: float, config: TemplateConfig):
