@@ -20,7 +20,7 @@ _BOUNDS = ("3dgs-dense",)
 
 @dataclass(frozen=True)
 class Sheet:
-    """One section: its name, how it is drawn (comparison, variants, curves, stability), its runs by row, and the rows
+    """One section: its name, how it is drawn (a key of `_DRAW`), its runs by row, and the rows
     that are a preset's choice, with the presets' names."""
 
     name: str
@@ -54,6 +54,14 @@ COLUMNS = (
     Column("compile s (wall)", "seconds_compile", 0),
     Column("kB", "bytes", 0, 1e-3),
     Column("frames/s", "fps", 0),
+)
+
+
+EVIDENCE = (
+    *(Column(f"poses by {kind}", f"poses_by_{kind}", 1) for kind in ("search", "matches", "registration")),
+    Column("turn, °", "rotation_deg", better=-1),
+    Column("shift, sizes", "translation_rel", 4, better=-1),
+    *(column for column in COLUMNS if column.title in ("PSNR changed", "PSNR full", "events F1", "CPU s")),
 )
 
 
@@ -133,6 +141,14 @@ def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
     ]
     path = images / f"results_{sheet.name}.png"
     return text + scatter(points, path, "CPU seconds, the first visit's among them", "PSNR changed, dB", sheet.chosen)
+
+
+def _evidence(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
+    """One row per variant that all captures are there of: what proposed poses, and how right they are."""
+    del images
+    named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
+    named = {name: found for name, found in named.items() if len(found) == len(sheet.runs[name])}
+    return "\n\n" + table(["variant", *(c.title for c in EVIDENCE)], _cells(named, EVIDENCE, named))
 
 
 def _curves(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
@@ -259,7 +275,13 @@ def _growth(lines: dict[tuple[str, str], list[tuple[float, float]]], path: Path)
     return f"\n![Error growth over each driver](images/{path.name})\n"
 
 
-_DRAW = {"comparison": _comparison, "variants": _variants, "curves": _curves, "stability": _stability}
+_DRAW = {
+    "comparison": _comparison,
+    "variants": _variants,
+    "evidence": _evidence,
+    "curves": _curves,
+    "stability": _stability,
+}
 
 
 def write_results(

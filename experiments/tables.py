@@ -204,6 +204,12 @@ ABLATION = {
     "without photographs of the first visit": (("fit.long.replay", 0.0),),
     "without the long fit": (("fit.long.passes", 0),),
 }
+EVIDENCE = {
+    "search alone": (("template.matches", False), ("fit.long.passes", 0)),
+    "search and matches": (("fit.long.passes", 0),),
+    "and registration": (("template.registration", True), ("fit.long.passes", 0)),
+}
+"""What proposes poses of known objects; as they are found, before the long fit."""
 QUICK = (("fit.long.passes", 4),)
 """A quarter of the long fit, with which everything else is varied: it changes no event, and the hour is short."""
 # Values beside those of the preset.
@@ -235,6 +241,7 @@ def sheets(preset: Preset, options: Options) -> list[Sheet]:
     return [
         Sheet("comparison", "comparison", comparison_runs(preset, given)),
         Sheet("ablation", "variants", _variants(preset, changing, ABLATION), own),
+        Sheet("evidence", "evidence", _variants(preset, changing, EVIDENCE)),
         Sheet("steps", "variants", _at_more_steps(preset, scene)),
         Sheet("curves", "curves", curve_runs(preset.effort), chosen_points()),
         Sheet("stability", "stability", stability_runs(preset.effort)),

@@ -101,7 +101,8 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     said["splats"] += chronology.background.count
     events = [s for each in read_tracks(out / "tracks.json")["objects"] for s in each["states"]]
     said["confidence"] = mean(s["confidence"] for s in events if s["event"] not in ("still", "unseen"))
-    said |= {f"poses_by_{kind}": float(count) for kind, count in winners(out).items()}
+    won = winners(out)
+    said |= {f"poses_by_{kind}": float(won[kind]) for kind in ("search", "matches", "registration")}
     row = score(problem, per_visit_answer(scenes, (out / "chronology.safetensors").stat().st_size, said), folder)
     return {
         **row,
