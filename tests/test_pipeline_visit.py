@@ -10,19 +10,21 @@ from ltgs_jax.detect import ChangeMap
 from ltgs_jax.fit import View, VisitView
 from ltgs_jax.geometry import C0, SE3, Camera
 from ltgs_jax.pipeline.arrivals import _left_beside, convincing
+from ltgs_jax.pipeline.carried import carry_on
 from ltgs_jax.pipeline.config import Config
 from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
 from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host
 from ltgs_jax.pipeline.outputs import _name_of, _track
-from ltgs_jax.pipeline.prune import drop_idle, late_splats, merge_ground
+from ltgs_jax.pipeline.prune import drop_idle, late_splats, merge_ground, without
 from ltgs_jax.pipeline.reshaped import join_states
 from ltgs_jax.pipeline.state import (
     Account,
     State,
     add_template,
     composed,
+    cut_background,
     extend_background,
     extend_template,
     hand_over,
@@ -278,15 +280,50 @@ def test_splats_that_buy_nothing_go_and_what_the_first_visit_brought_stays(state
         image = np.rint(255 * eye.image(drop_hidden(composed(state.chronology, t)), camera)).astype(np.uint8)
         views.append(VisitView(View(camera, image, np.ones((48, 64), bool)), t))
     late = np.asarray(state.chronology.since) > 0
-    after, dropped = drop_idle(state, np.pad(late, (0, 180)), views, eye)
+    after, gone = drop_idle(state, np.pad(late, (0, 180)), views, eye)
     since = np.asarray(after.chronology.since)
     heights = np.asarray(after.chronology.background.means)[since == 2, 2]
     assert (since == 0).sum() == 6400
     assert (heights < 0).sum() < 0.1 * 300 and (heights > 0).sum() > 0.9 * 200
-    assert dropped == 500 - (since == 2).sum()
+    assert gone.sum() == 500 - (since == 2).sum() and not gone[~np.pad(late, (0, 180))].any()
     assert len(after.errors) == len(after.guessed) == len(since)
     untouched = State.of_initial(bright, np.zeros(200, np.float32), ("a", "b", "c", "d"))
-    assert drop_idle(untouched, np.zeros(200, bool), views, eye)[1] == 0
+    assert drop_idle(untouched, np.zeros(200, bool), views, eye)[1].sum() == 0
+
+
+def test_what_a_fit_made_of_earlier_visits_is_carried_to_one_more(state):
+    rng = np.random.default_rng(12)
+    patch, mug = _box(rng, 60, [-0.9, -0.9, 0], [-0.6, -0.6, 0.01]), _box(rng, 30, [0.5, 0.5, 0], [0.6, 0.6, 0.1])
+    before = extend_background(state, patch, np.zeros(60, np.float32), np.zeros(60, bool), 1)
+    gone = np.zeros(400 + 60 + 180, bool)
+    gone[430:460] = True  # half of the late ground bought nothing
+    fitted = without(before, gone)
+    brighter = fitted.chronology.templates[0].splats.sh + np.float32(0.1)
+    poses = np.array(fitted.chronology.world_from_template.xyz)
+    poses[1:, 0, 0] += 0.01
+    shade, shadows = np.full((4, 1, 4), 0.2, np.float32), object()
+    fitted = eqx.tree_at(
+        lambda s: (s.chronology.templates[0].splats.sh, s.chronology.world_from_template.xyz, s.chronology.shade,
+                   s.chronology.shadows),
+        fitted, (brighter, poses, shade, shadows), is_leaf=lambda leaf: leaf is None,
+    )  # fmt: skip
+    # A visit later the stack moves on, something new comes, and some of the floor is cut out.
+    later = cut_background(before, np.arange(460) < 25)
+    later = set_from(later, 3, 0, visible=True, pose=_shifted(-0.4))
+    later = add_template(later, Template(mug, 2, 3), np.zeros(30, np.float32), _FLOOR, 3)
+    carried, dropped = carry_on(later, before, fitted, gone)
+    chronology = carried.chronology
+    assert dropped.sum() == 30 and not dropped[435:].any()
+    assert chronology.background.count == 400 - 25 + 30 == len(carried.errors) == len(chronology.since)
+    np.testing.assert_array_equal(chronology.templates[0].splats.sh, brighter)
+    np.testing.assert_array_equal(chronology.templates[1].splats.means, mug.means)
+    np.testing.assert_allclose(chronology.world_from_template.xyz[:, 0, 0], [0, 0.61, 0.61, -0.4], atol=1e-6)
+    np.testing.assert_allclose(chronology.shade[:, :, 0], [[0.2, 0], [0.2, 0], [0.2, 0], [0, 0]], atol=1e-7)
+    assert chronology.shadows is shadows
+    # Nothing new: what the fit gave, as it is.
+    same, dropped = carry_on(before, before, fitted, gone)
+    assert eqx.tree_equal(same.chronology.background, fitted.chronology.background) and dropped.sum() == 30
+    assert eqx.tree_equal(same.chronology.templates, fitted.chronology.templates)
 
 
 def test_what_later_visits_added_to_an_object_of_the_first_is_theirs(state):

@@ -26,7 +26,7 @@ from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypothes
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.locate import freedoms_of, relit
-from ltgs_jax.template.removal import gone_evidence, taken_down, with_foot
+from ltgs_jax.template.removal import _joined, gone_evidence, taken_down, with_foot
 
 
 def _splats(points: np.ndarray, colors: np.ndarray, scale: float) -> Splats:
@@ -228,6 +228,24 @@ def test_a_box_that_turned_in_place_goes_as_a_whole(changed, taken):
     assert len(found) == 1
     assert found[0].members[on_box].mean() > taken  # less of it at its foot, which says that it stayed
     assert found[0].share < 0.7
+
+
+@pytest.mark.parametrize(
+    ("gap", "color", "left", "things"),
+    [
+        (0.01, 0.2, 1.0, 1),  # rim and handle of a pan, with a few splats missing between
+        (0.01, 0.6, 1.0, 2),  # a light thing beside a dark one
+        (0.3, 0.2, 1.0, 2),  # two alike, apart
+        (0.01, 0.2, 0.3, 2),  # one that left beside one that turned where it stands
+    ],
+)
+def test_parts_that_touch_look_alike_and_left_alike_are_one_thing(gap, color, left, things):
+    rng = np.random.default_rng(14)
+    halves = rng.uniform([0, -0.1, 0], [0.2, 0.1, 0.05], (2, 400, 3)) + np.array([[[-0.2, 0, 0]], [[gap, 0, 0]]])
+    means, colors = halves.reshape(-1, 3), np.repeat([[0.2] * 3, [color] * 3], 400, axis=0)
+    share = np.repeat([1.0, left], 400)
+    joined = _joined([np.arange(400), np.arange(400, 800)], means, colors, share, 1 - share)
+    assert len(joined) == things and sum(map(len, joined)) == 800
 
 
 def test_a_box_that_turned_beside_covered_ground_goes_and_the_ground_stays():

@@ -256,6 +256,7 @@ def fit_chronology(
     views: Sequence[VisitView],
     *,
     key: Array,
+    since: int = 1,
     config: LongConfig = LongConfig(),
     progress: Callable[[int, int, str], None] = lambda i, n, text: None,
 ) -> tuple[Chronology, Float[np.ndarray, " s"]]:
@@ -264,23 +265,24 @@ def fit_chronology(
 
     Windows of the photographs hold what templates show, and ground that a later visit brought to light (`windows_of`);
     background splats close to an object, that show hardly outside of it, may change; all others stay bit for bit.
-    Windows of visit 0 are replayed for the share `config.replay` of the steps. Of the windows of later visits, squares
-    are held out: where their error has not fallen for a third of the passes, the fit ends, and goes back to where it
-    was least; so it does when a loss is not finite. Returns the chronology and the loss of every step.
+    Windows of visit 0, and of all that come before visit `since`, which an earlier fit has seen, are replayed for the
+    share `config.replay` of the steps; shades and shadows go on from those that there are. Of the windows of later
+    visits, squares are held out: where their error has not fallen for a third of the passes, the fit ends, and goes
+    back to where it was least; so it does when a loss is not finite. Returns the chronology and the loss of every step.
 
-    Raises ValueError without a photograph of a later visit.
+    Raises ValueError without a photograph of a visit from `since` on.
     """
-    if not any(v.visit > 0 for v in views):
-        raise ValueError("views: expected photographs of a later visit, got none")
+    if not any(v.visit >= max(since, 1) for v in views):
+        raise ValueError(f"views: expected photographs of visit {max(since, 1)} or later, got none")
     if config.passes == 0:
         return chronology, np.zeros(0, np.float32)
     side = window_side([size_of(v.view) for v in views], config.window)
     background, templates = chronology.background, chronology.templates
     owner = np.repeat(np.arange(1 + len(templates)), [background.count, *(m.splats.count for m in templates)])
-    since = np.zeros(len(owner), np.int32)
+    shows_from = np.zeros(len(owner), np.int32)
     if chronology.since is not None:
-        since[: background.count] = chronology.since
-    came = (owner > 0) | (since > 0)
+        shows_from[: background.count] = chronology.since
+    came = (owner > 0) | (shows_from > 0)
     visits = {}
     for t in sorted({v.visit for v in views}):
         splats = jax.tree.map(np.asarray, _composed(chronology, jnp.asarray(t)))
@@ -298,9 +300,9 @@ def fit_chronology(
     free, held = np.flatnonzero(may_change), np.flatnonzero(~may_change)
     fixed = _Fixed(
         jax.device_put(pad_splats(every[held], 1)),
-        jnp.asarray(since[held]),
+        jnp.asarray(shows_from[held]),
         jnp.asarray(owner[free]),
-        jnp.asarray(since[free]),
+        jnp.asarray(shows_from[free]),
         jnp.asarray(came[free]),
         # What the few photographs of a later visit show tells no colour that depends on the direction.
         jnp.asarray(~every.sh[free, 1:].any(axis=(1, 2))),
@@ -310,10 +312,11 @@ def fit_chronology(
         jnp.asarray(diameters[np.asarray(placements.template)]),
         jnp.asarray(scene_extent([v.view.camera for v in views]), jnp.float32),
     )
-    still = [jnp.zeros((len(placements.template), freedoms), jnp.float32) for freedoms in (6, 4)]
-    start = _Variables(jax.device_put(every[free]), *still, shadows.log_gain)
+    tangents = jnp.zeros((len(placements.template), 6), jnp.float32)
+    shades = _shades_of(chronology, placements, frames[1:])
+    start = _Variables(jax.device_put(every[free]), tangents, shades, shadows.log_gain)
     rows = [(_rows_among(w.rows, free), _rows_among(w.rows, held)) for w in windows]
-    fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, config=config, progress=progress)
+    fitted, losses = _fit_windows(start, fixed, windows, rows, key=key, since=since, config=config, progress=progress)
     for leaf, new in zip(jax.tree.leaves(every), jax.tree.leaves(fitted.splats), strict=True):
         leaf[free] = np.asarray(new)
     return _with_fitted(chronology, every, fixed, fitted), losses
@@ -338,13 +341,34 @@ def _with_fitted(chronology: Chronology, every: Splats, fixed: _Fixed, fitted: _
     return jax.tree.map(jnp.asarray, fitted_chronology)
 
 
+def _shades_of(chronology: Chronology, placements: Placements, frames: Float[np.ndarray, "k 4"]) -> Float[Array, "p 4"]:
+    """The shade of each distinct pose: its constant at the middle of the template, and its slope in diameters."""
+    shades = np.zeros((len(placements.template), 4), np.float32)
+    if chronology.shade is not None:
+        index = np.asarray(placements.index)
+        for t, k in np.ndindex(index.shape):
+            constant, slope = np.split(np.asarray(chronology.shade[t, k]), [1])
+            shades[index[t, k]] = np.r_[constant + slope @ frames[k, :3], slope * frames[k, 3]]
+    return jnp.asarray(shades)
+
+
 def _shadows_of(chronology: Chronology, placements: Placements, frames: Float[np.ndarray, "k 4"]) -> Shadows:
-    """Shadows without effect of every place at which an object stands at some visits and not at others."""
+    """Shadows of every place at which an object stands at some visits and not at others: as strong as those that there
+    are just so, else without effect."""
     template, index = np.asarray(placements.template), np.asarray(placements.index)
     middles = placements.poses.apply(jnp.asarray(frames[template, None, :3], jnp.float32))[:, 0]
     here = index[:, template] == np.arange(len(template))
     occupied = here & np.asarray(chronology.visible)[:, template]
-    return lay_blobs(chronology.background, np.asarray(middles), frames[template, 3], occupied)
+    laid = lay_blobs(chronology.background, np.asarray(middles), frames[template, 3], occupied)
+    if chronology.shadows is None:
+        return laid
+
+    def names(shadows: Shadows) -> list[bytes]:
+        return [row.tobytes() for row in np.c_[np.asarray(shadows.centers), np.asarray(shadows.radii)]]
+
+    gains = dict(zip(names(chronology.shadows), np.asarray(chronology.shadows.log_gain), strict=True))
+    strengths = np.asarray([gains.get(name, 0) for name in names(laid)], np.float32)
+    return eqx.tree_at(lambda s: s.log_gain, laid, jnp.asarray(strengths))
 
 
 def _close_to_objects(
@@ -367,11 +391,19 @@ def _rows_among(rows: Int[np.ndarray, " m"], chosen: Int[np.ndarray, " n"]) -> I
 
 
 def _fit_windows(
-    variables: _Variables, fixed: _Fixed, windows: Sequence[Window], rows, *, key, config: LongConfig, progress
+    variables: _Variables,
+    fixed: _Fixed,
+    windows: Sequence[Window],
+    rows,
+    *,
+    key,
+    since: int,
+    config: LongConfig,
+    progress,
 ) -> tuple[_Variables, Float[np.ndarray, " s"]]:
     """The steps, each on windows drawn at random."""
-    later = [i for i, w in enumerate(windows) if w.visit > 0]
-    first = [i for i, w in enumerate(windows) if w.visit == 0]
+    later = [i for i, w in enumerate(windows) if w.visit >= since]
+    first = [i for i, w in enumerate(windows) if w.visit < since]
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     replayed = config.replay if first else 0.0
     mesh = mesh_for(config.batch)
@@ -382,8 +414,9 @@ def _fit_windows(
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
         return variables, losses
     dealt = "" if config.batch == 1 else f"; {config.batch} a step, on {mesh.size} of {jax.device_count()} devices"
-    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of the first{dealt}")
-    looks, plan_of = _looks(windows, rows, fixed, rng), partial(_plan, fixed=fixed)
+    before = "the first" if since == 1 else "those before"
+    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of {before}{dealt}")
+    looks, plan_of = _looks(windows, rows, fixed, since, rng), partial(_plan, fixed=fixed)
     state = adam().init(variables)
     queues: dict[bool, list[int]] = {True: [], False: []}
 
@@ -409,7 +442,7 @@ def _fit_windows(
             plan = plan_of(variables, looks)
         if step % 100 == 0 or step == steps - 1:
             progress(step + 1, steps, f"loss {losses[max(0, step - 100) : step + 1].mean():.4f}")
-        error, drawn = error + config.batch * float(unseen), drawn + sum(windows[i].visit > 0 for i in chosen)
+        error, drawn = error + config.batch * float(unseen), drawn + sum(windows[i].visit >= since for i in chosen)
         if drawn < len(later):
             continue
         errors.append(error / drawn)
@@ -429,7 +462,7 @@ def _held_out(side: int, rng: np.random.Generator) -> Bool[np.ndarray, "s s"]:
     return tiles.repeat(_TILE, axis=0).repeat(_TILE, axis=1)[:side, :side]
 
 
-def _looks(windows: Sequence[Window], rows, fixed: _Fixed, rng: np.random.Generator) -> list[_Look]:
+def _looks(windows: Sequence[Window], rows, fixed: _Fixed, since: int, rng: np.random.Generator) -> list[_Look]:
     """Each window by itself, on the host, all of one shape and its visit traced, so that one program serves all; of
     those of later visits, squares are held out."""
     counts = (fixed.owner.shape[0], fixed.ground.count)
@@ -438,7 +471,7 @@ def _looks(windows: Sequence[Window], rows, fixed: _Fixed, rng: np.random.Genera
     for window, pair in zip(windows, rows, strict=True):
         own, ground = (_padded(r, length, count) for r, length, count in zip(pair, lengths, counts, strict=True))
         window = eqx.tree_at(lambda w: (w.visit, w.rows), window, (np.asarray(window.visit), None))
-        held = _held_out(len(window.mask), rng) & (window.visit > 0)
+        held = _held_out(len(window.mask), rng) & (window.visit >= since)
         looks.append(_Look(jax.tree.map(np.asarray, window), held, own, ground, np.arange(len(own), dtype=np.int32)))
     return looks
 

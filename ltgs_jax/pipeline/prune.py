@@ -32,14 +32,17 @@ def late_splats(state: State, first: Splats) -> Bool[np.ndarray, " n"]:
     return np.concatenate([np.asarray(chronology.since) > 0, *map(came, chronology.templates)])
 
 
-def drop_idle(state: State, late: Bool[np.ndarray, " n"], views: Sequence[VisitView], eye: Eye) -> tuple[State, int]:
+def drop_idle(
+    state: State, late: Bool[np.ndarray, " n"], views: Sequence[VisitView], eye: Eye
+) -> tuple[State, Bool[np.ndarray, " n"]]:
     """The state without as many as possible of its `late_splats`, those that show least first, at no more than a price
-    in squared error over photographs of later visits; and how many went.
+    in squared error over photographs of later visits; and which went, as a mask over the background's splats and then
+    each template's.
 
     What came with the first visit stays as it is.
     """
     if not late.any():
-        return state, 0
+        return state, late
     counts = [state.chronology.background.count, *(m.splats.count for m in state.chronology.templates)]
     owner = np.repeat(np.arange(len(counts)), counts)
     visits = {v.visit: [w for w in views if w.visit == v.visit] for v in views}
@@ -68,10 +71,17 @@ def drop_idle(state: State, late: Bool[np.ndarray, " n"], views: Sequence[VisitV
         count = (low + high) // 2
         low, high = (count, high) if error(idle(count)) <= most else (low, count)
     gone = idle(low)
-    state = cut_background(state, gone[owner == 0])
-    for k in range(len(state.chronology.templates)):
-        state = cut_template(state, k, gone[owner == k + 1])
-    return state, int(gone.sum())
+    return without(state, gone), gone
+
+
+def without(state: State, gone: Bool[np.ndarray, " n"]) -> State:
+    """The state without some of its splats, by a mask over the background's and then each template's."""
+    ends = np.cumsum([state.chronology.background.count, *(m.splats.count for m in state.chronology.templates)])
+    ground, *templates = np.split(gone, ends[:-1])
+    state = cut_background(state, ground)
+    for k, part in enumerate(templates):
+        state = cut_template(state, k, part)
+    return state
 
 
 def merge_ground(state: State) -> State:

@@ -289,6 +289,8 @@ def unpack_state(arrays: dict[str, np.ndarray], notes: dict, visits: tuple[str, 
     known = np.minimum(np.arange(len(visits)), len(arrays["visible"]) - 1)
     quat, xyz, visible = (jnp.asarray(arrays[name][known]) for name in ("quat", "xyz", "visible"))
     state = _with_templates(start, tuple(templates), SE3(quat, xyz), visible, tuple(errors), tuple(supports))
-    shadows = module_of(Shadows, "shadows", arrays) if "shadows.cast" in arrays else None
-    lit = (arrays.get("shade"), shadows)
+    shade, shadows = arrays["shade"][known] if "shade" in arrays else None, None
+    if "shadows.cast" in arrays:
+        shadows = module_of(Shadows, "shadows", {**arrays, "shadows.cast": arrays["shadows.cast"][known]})
+    lit = (shade, shadows)
     return eqx.tree_at(lambda s: (s.chronology.shade, s.chronology.shadows), state, lit, is_leaf=_is_none)

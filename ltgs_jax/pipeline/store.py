@@ -80,6 +80,11 @@ class Store:
         self._row(row)
         return arrays, json.loads(header["notes"])
 
+    def peek(self, name: str, key: str) -> tuple[dict[str, np.ndarray], dict] | None:
+        """The arrays and notes of a stage as it was left by a run with another key; None where it was not."""
+        found = _read(self.folder / f"{name}.safetensors", digest(_FORMAT, key))
+        return None if found is None else (found[0], found[1]["notes"])
+
     def _row(self, row: dict) -> None:
         self.rows.append(row)
         write_json(self.summary, self.rows)

@@ -32,6 +32,7 @@ from ltgs_jax.io import (
 from ltgs_jax.scene import Chronology, Splats, drop_hidden
 
 from .cameras import Run, hold_against_renders, locate_photographs, scaled_camera
+from .carried import carry_on
 from .config import Config, check_config
 from .evaluate import evaluate
 from .expected import expected_errors
@@ -106,17 +107,20 @@ def update(
         splats, errors = _initial_scene(store, first, run, scene, front_end, eye, progress)
         key = digest(key, first, *(part for each in poses for part in each))
         run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
-        state = State.of_initial(splats, errors, capture.visits)
+        states = [State.of_initial(splats, errors, capture.visits)]
         accounts: list[list[Account]] = [[]]
         key = digest(first, config.detect, config.match, config.template, config.register)
+        fits = [digest(key, "fit", config.fit.long)]
         for t in visits[1:]:
             key = digest(key, t, files[t], *run.poses(t))
             free_programs()
-            state, told, run = _one_visit(store, key, run, state, t, front_end, eye, progress)
+            state, told, run = _one_visit(store, key, run, states[-1], t, front_end, eye, progress)
+            states.append(state)
             accounts.append(told)
-        key = digest(key, "fit", config.fit.long)
+            fits.append(digest(key, "fit", config.fit.long))
+        key, state = fits[-1], states[-1]
         later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
-        chronology = _long_fit(store, key, run, state, splats, later, eye, progress)
+        chronology = _long_fit(store, fits, run, states, later, eye, progress)
         _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
@@ -255,9 +259,12 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
     return unpack_state(arrays, notes, run.capture.visits), accounts, run
 
 
-def _long_fit(store: Store, key: str, run: Run, state: State, initial: Splats, later, eye: Eye, progress) -> Chronology:
-    """Everything together; skipped, and said so, when nothing changed."""
-    config = run.config
+def _long_fit(
+    store: Store, keys: Sequence[str], run: Run, states: Sequence[State], later, eye: Eye, progress
+) -> Chronology:
+    """The chronology with everything fitted together; skipped, and said so, when nothing changed. From what a fit left
+    on disk of fewer visits (by the keys of each number of them) it goes on: the visits since then alone are new."""
+    config, state = run.config, states[-1]
 
     def compute():
         if not state.chronology.templates:
@@ -265,23 +272,47 @@ def _long_fit(store: Store, key: str, run: Run, state: State, initial: Splats, l
             arrays, notes = pack_state(state)
             return arrays, {**notes, "counts": {"steps": 0}}
         lean = merge_ground(state)
-        first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-        chronology, losses = fit_chronology(
-            lean.chronology,
-            first + later(),
-            key=jax.random.key(run.seed + 1),
-            config=config.fit.long,
-            progress=progress.step,
-        )
-        fitted = eqx.tree_at(lambda s: s.chronology, lean, jax.tree.map(np.asarray, chronology))
-        fitted, idle = drop_idle(fitted, late_splats(lean, initial), later(), eye)
-        arrays, notes = pack_state(fitted)
         merged = state.chronology.background.count - lean.chronology.background.count
-        counts = {"steps": len(losses), "splats_merged": merged, "splats_dropped": idle}
-        return arrays, {**notes, "counts": counts}
+        late = late_splats(lean, states[0].chronology.background)
+        since, earlier = _earlier_fit(store, keys, run, states)
+        gone = np.zeros(len(late), bool)
+        if earlier is not None:
+            lean, gone = carry_on(lean, *earlier)
+            names = ", ".join(run.capture.visits[since:])
+            progress.note(f"going on from the fit of the visits before {names}")
+        fitted, losses, idle = lean, np.zeros(0), np.zeros((~gone).sum(), bool)
+        if earlier is None or not eqx.tree_equal(states[since - 1], state):
+            first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
+            chronology, losses = fit_chronology(
+                lean.chronology,
+                first + later(),
+                key=jax.random.key(run.seed + since),
+                since=since,
+                config=config.fit.long,
+                progress=progress.step,
+            )
+            fitted = eqx.tree_at(
+                lambda s: s.chronology, lean, jax.tree.map(np.asarray, chronology), is_leaf=lambda x: x is None
+            )
+            fitted, idle = drop_idle(fitted, late[~gone], later(), eye)
+        arrays, notes = pack_state(fitted)
+        counts = {"steps": len(losses), "splats_merged": merged, "splats_dropped": int(idle.sum())}
+        gone[np.flatnonzero(~gone)[idle]] = True
+        return {**arrays, "gone": gone}, {**notes, "counts": counts}
 
-    arrays, notes = store.run("fit", key, compute)
+    arrays, notes = store.run("fit", keys[-1], compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology
+
+
+def _earlier_fit(store: Store, keys: Sequence[str], run: Run, states: Sequence[State]):
+    """The first visit that the fit on disk has not seen, and the state before that fit, the one after it, and what it
+    left out; 1 and None where there is no such fit of anything that changed."""
+    for t in reversed(range(1, len(keys) - 1)):
+        found = store.peek("fit", keys[t])
+        if found is not None and states[t].chronology.templates:
+            arrays, notes = found
+            return t + 1, (merge_ground(states[t]), unpack_state(arrays, notes, run.capture.visits), arrays["gone"])
+    return 1, None
 
 
 def _later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[VisitView]:
