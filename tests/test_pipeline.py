@@ -145,30 +145,33 @@ def _fit_steps(run):
 
 
 def test_a_visit_that_comes_later_costs_what_it_changes_and_ends_as_good_as_all_at_once(tmp_path):
+    config = replace(CONFIG, fit=replace(CONFIG.fit, long=_TINY.fit.long))  # enough passes for what is told apart
     capture, aside = write_tiny_capture(tmp_path / "capture", again=True), tmp_path / "t2"
     (capture / "images" / "t2").rename(aside)
-    pipeline.update(capture, tmp_path / "grown", config=CONFIG, progress=Quiet())
+    pipeline.update(capture, tmp_path / "grown", config=config, progress=Quiet())
     known = read_tracks(tmp_path / "grown" / "tracks.json")["objects"]
     before = _fit_steps(tmp_path / "grown")
     aside.rename(capture / "images" / "t2")
     progress = Quiet()
-    pipeline.update(capture, tmp_path / "grown", config=CONFIG, progress=progress)
+    pipeline.update(capture, tmp_path / "grown", config=config, progress=progress)
     assert {"initial: taken from disk", "visit_001: taken from disk"} <= set(progress.lines)
     assert "visit_002: taken from disk" not in progress.lines and "fit: taken from disk" not in progress.lines
     assert "going on from the fit of the visits before t2" in progress.lines
     objects = read_tracks(tmp_path / "grown" / "tracks.json")["objects"]
     assert [[state["event"] for state in item["states"]] for item in known] == [["moved"]]
     assert [state["event"] for state in objects[0]["states"]] == ["moved", "moved"]
-    pipeline.update(capture, tmp_path / "at_once", config=CONFIG, progress=Quiet())
+    pipeline.update(capture, tmp_path / "at_once", config=config, progress=Quiet())
     grown, at_once = _psnr(tmp_path / "grown"), _psnr(tmp_path / "at_once")
     assert grown.keys() == at_once.keys()
-    assert all(grown[key] > at_once[key] - 0.2 for key in grown)
+    apart = {key: round(grown[key] - at_once[key], 3) for key in grown}
+    assert min(value for (_, region), value in apart.items() if region == "full") > -0.2, apart
+    assert min(apart.values()) > -0.5, apart
     assert before + _fit_steps(tmp_path / "grown") <= _fit_steps(tmp_path / "at_once") + 1
     visits = [name for name in ("grown", "at_once") if (tmp_path / name / "stages" / "visit_002.safetensors").exists()]
     first, second = ((tmp_path / name / "stages" / "visit_002.safetensors").read_bytes() for name in visits)
     assert first[-1000:] == second[-1000:]  # explained alike: the arrays, after a header with times
     progress = Quiet()
-    pipeline.update(capture, tmp_path / "grown", config=CONFIG, progress=progress)
+    pipeline.update(capture, tmp_path / "grown", config=config, progress=progress)
     assert "fit: taken from disk" in progress.lines
 
 

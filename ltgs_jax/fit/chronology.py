@@ -35,6 +35,7 @@ from .windows import Shown, Window, window_side, windows_of, within_change
 _PRICE = 1e-3  # of a shadow's gain, as the slope of the loss
 _TILE = 8  # side in pixels of the squares that are held out
 _HELD_OUT = 1 / 16  # of the squares of every window of a later visit
+_FIRST = 0.5  # share of the first visit in what is replayed, where later ones were fitted before
 _PATIENCE = 0.3  # share of the passes that may, one after the other, come out no better than the best before
 
 
@@ -265,10 +266,11 @@ def fit_chronology(
 
     Windows of the photographs hold what templates show, and ground that a later visit brought to light (`windows_of`);
     background splats close to an object, that show hardly outside of it, may change; all others stay bit for bit.
-    Windows of visit 0, and of all that come before visit `since`, which an earlier fit has seen, are replayed for the
-    share `config.replay` of the steps; shades and shadows go on from those that there are. Of the windows of later
-    visits, squares are held out: where their error has not fallen for a third of the passes, the fit ends, and goes
-    back to where it was least; so it does when a loss is not finite. Returns the chronology and the loss of every step.
+    Windows of visit 0, and of those before visit `since`, which an earlier fit has seen, are replayed for the share
+    `config.replay` of the steps, half and half; shades and shadows go on from those that there are. Of the windows of
+    later visits, squares are held out: where their error has not fallen for a third of the passes, the fit ends, and
+    goes back to where it was least; so it does when a loss is not finite. Returns the chronology and the loss of every
+    step.
 
     Raises ValueError without a photograph of a visit from `since` on.
     """
@@ -403,9 +405,10 @@ def _fit_windows(
 ) -> tuple[_Variables, Float[np.ndarray, " s"]]:
     """The steps, each on windows drawn at random."""
     later = [i for i, w in enumerate(windows) if w.visit >= since]
-    first = [i for i, w in enumerate(windows) if w.visit < since]
+    first = [i for i, w in enumerate(windows) if w.visit == 0]
+    seen = [i for i, w in enumerate(windows) if 0 < w.visit < since]
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
-    replayed = config.replay if first else 0.0
+    replayed = config.replay if first or seen else 0.0
     mesh = mesh_for(config.batch)
     steps = round(config.passes * len(later) / max(1 - replayed, 0.1) / config.batch)
     steps = max(steps, 1) if later else 0
@@ -414,17 +417,20 @@ def _fit_windows(
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
         return variables, losses
     dealt = "" if config.batch == 1 else f"; {config.batch} a step, on {mesh.size} of {jax.device_count()} devices"
-    before = "the first" if since == 1 else "those before"
-    progress(0, steps, f"{len(later)} windows of later visits, {len(first)} of {before}{dealt}")
+    told = f"{len(later)} windows of later visits, {len(first)} of the first"
+    progress(0, steps, told + (f", {len(seen)} fitted before" if seen else "") + dealt)
     looks, plan_of = _looks(windows, rows, fixed, since, rng), partial(_plan, fixed=fixed)
     state = adam().init(variables)
-    queues: dict[bool, list[int]] = {True: [], False: []}
+    queues: dict[str, list[int]] = {"later": [], "first": [], "seen": []}
 
     def draw() -> int:
-        replay = rng.random() < replayed
-        queue = queues[replay]
+        name, every = "later", later
+        if rng.random() < replayed:
+            of_first = first and (not seen or rng.random() < _FIRST)
+            name, every = ("first", first) if of_first else ("seen", seen)
+        queue = queues[name]
         if not queue:
-            queue.extend(rng.permutation(first if replay else later).tolist())
+            queue.extend(rng.permutation(every).tolist())
         return queue.pop()
 
     plan = plan_of(variables, looks)
