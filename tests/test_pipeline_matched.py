@@ -86,7 +86,7 @@ def window(box):
 
 @pytest.fixture(scope="module")
 def known(box):
-    return surface_of(render_sides(box, _FLOOR, size=_SIZE, side=SIDE), Classical(), size=_SIZE)
+    return surface_of(render_sides(box, _FLOOR, size=_SIZE, side=SIDE), Classical(), size=_SIZE, dense=True)
 
 
 def test_sides_show_the_surface_where_it_is(box):

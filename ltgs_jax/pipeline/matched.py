@@ -31,7 +31,8 @@ _NOISE = 0.1  # sizes, by which the surface of a volume that outlines leave may 
 
 class Surface(eqx.Module):
     """What is known of a template's surface, for matches: points in its own frame with the descriptors of keypoints
-    that sides of it show, points with dense descriptors, and its diameter in scene units."""
+    that sides of it show, points with dense descriptors (none, where nothing asks for them), and its diameter in scene
+    units."""
 
     keypoints: Float[np.ndarray, "n 3"]
     descriptors: Float[np.ndarray, "n d"]
@@ -40,8 +41,8 @@ class Surface(eqx.Module):
     size: float
 
 
-def surface_of(sides: Sides, front_end: FrontEnd, *, size: float) -> Surface:
-    """The surface that a template shows from its sides."""
+def surface_of(sides: Sides, front_end: FrontEnd, *, size: float, dense: bool) -> Surface:
+    """The surface that a template shows from its sides, with `dense` descriptors or without."""
     points, descriptors = [], []
     for image, surface, firm in zip(sides.images, sides.points, sides.firm, strict=True):
         xy, described = front_end.keypoints(image)
@@ -49,8 +50,10 @@ def surface_of(sides: Sides, front_end: FrontEnd, *, size: float) -> Surface:
         columns, rows = np.floor(xy[on]).astype(int).T
         points.append(surface[rows, columns])
         descriptors.append(described[on])
-    dense = _described(sides.images, sides.points, sides.firm, front_end, _MORE * _SURFACE)
-    return Surface(np.concatenate(points), np.concatenate(descriptors), *dense, size)
+    every = np.zeros((0, 3)), np.zeros((0, 1))
+    if dense:
+        every = _described(sides.images, sides.points, sides.firm, front_end, _MORE * _SURFACE)
+    return Surface(np.concatenate(points), np.concatenate(descriptors), *every, size)
 
 
 class Matcher:
@@ -69,7 +72,7 @@ class Matcher:
         if k not in self._surfaces:
             size = template_diameter(splats)
             sides = render_sides(splats, support, size=size, side=SIDE)
-            self._surfaces[k] = surface_of(sides, self._front_end, size=size)
+            self._surfaces[k] = surface_of(sides, self._front_end, size=size, dense=options.registration)
         if options.matches:
             found["matches"] = pose_from_keypoints(self._surfaces[k], window, self._front_end)
         if options.registration:
