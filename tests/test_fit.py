@@ -303,8 +303,11 @@ def test_an_object_that_stays_has_one_pose():
 def test_long_fit_wants_a_later_photograph():
     truth, _ = _moved_chronology(0.0)
     views = [VisitView(_view(compose(truth, 0), _camera(0.0)), 0)]
-    with pytest.raises(ValueError, match="later visit"):
+    with pytest.raises(ValueError, match="later visit, 1 or beyond"):
         fit_chronology(truth, views, key=jax.random.key(0))
+    views.append(VisitView(_view(compose(truth, 1), _camera(0.0)), 1))
+    with pytest.raises(ValueError, match="later visit, 2 or beyond"):
+        fit_chronology(truth, views, key=jax.random.key(0), since=2)
 
 
 def test_local_fit_lowers_the_error_in_its_windows():

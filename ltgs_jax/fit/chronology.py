@@ -275,7 +275,7 @@ def fit_chronology(
     Raises ValueError without a photograph of a visit from `since` on.
     """
     if not any(v.visit >= max(since, 1) for v in views):
-        raise ValueError(f"views: expected photographs of visit {max(since, 1)} or later, got none")
+        raise ValueError(f"views: expected photographs of a later visit, {max(since, 1)} or beyond, got none")
     if config.passes == 0:
         return chronology, np.zeros(0, np.float32)
     side = window_side([size_of(v.view) for v in views], config.window)
