@@ -20,8 +20,8 @@ _BOUNDS = ("3dgs-dense",)
 
 @dataclass(frozen=True)
 class Sheet:
-    """One section: its name, how it is drawn (a key of `_DRAW`), its runs by row, and the rows
-    that are a preset's choice, with the presets' names."""
+    """One section: its name, how it is drawn (a key of `_DRAW`), its runs by row, and the rows that are a preset's
+    choice, with the presets' names."""
 
     name: str
     kind: str
@@ -91,6 +91,12 @@ def _done(runs: Iterable[Run], rows: dict[str, dict]) -> list[dict]:
     return [rows[run.name] for run in runs if run.name in rows and rows[run.name]["status"] == "done"]
 
 
+def _complete(sheet: Sheet, rows: dict[str, dict]) -> dict[str, list[dict]]:
+    """The rows of each variant that all captures are there of."""
+    named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
+    return {name: found for name, found in named.items() if len(found) == len(sheet.runs[name])}
+
+
 def _comparison(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
     """Means over the captures that every method has finished, then each capture, then each visit."""
     labels = list(dict.fromkeys(run.options.scene.capture.label for runs in sheet.runs.values() for run in runs))
@@ -129,8 +135,7 @@ def _comparison(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
 
 def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
     """One row per variant that all captures are there of."""
-    named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
-    named = {name: found for name, found in named.items() if len(found) == len(sheet.runs[name])}
+    named = _complete(sheet, rows)
     labels = {run.options.scene.capture.scene for runs in sheet.runs.values() for run in runs}
     text = f"Means over {', '.join(sorted(labels))}.\n\n" + table(
         ["variant", *(c.title for c in COLUMNS)], _cells(named, COLUMNS, named)
@@ -146,8 +151,7 @@ def _variants(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
 def _evidence(sheet: Sheet, rows: dict[str, dict], images: Path) -> str:
     """One row per variant that all captures are there of: what proposed poses, and how right they are."""
     del images
-    named = {name: _done(runs, rows) for name, runs in sheet.runs.items()}
-    named = {name: found for name, found in named.items() if len(found) == len(sheet.runs[name])}
+    named = _complete(sheet, rows)
     return "\n\n" + table(["variant", *(c.title for c in EVIDENCE)], _cells(named, EVIDENCE, named))
 
 

@@ -137,15 +137,20 @@ def _read_stage(path: Path):
     return content, json.loads(content.metadata()["notes"])
 
 
+def _stages(out: Path) -> dict[str, dict]:
+    """What a chronology says of each of its stages."""
+    return {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
+
+
 def winners(out: Path) -> Counter[str]:
     """How many poses of known objects each kind of evidence proposed, by the ledger of a chronology."""
-    stages = {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
+    stages = _stages(out)
     return Counter(row["evidence"] for row in stages["ledger"]["counts"]["ledger"] if row["evidence"])
 
 
 def stage_seconds(out: Path) -> dict[str, float]:
     """The seconds that the stages of a chronology took when they ran: all but the outputs', and the CPU's of each."""
-    stages = {row["stage"]: row for row in json.loads((out / "stages.json").read_text())}
+    stages = _stages(out)
     counted = [row for name, row in stages.items() if name not in ("outputs", "evaluate")]
     return {
         "seconds": sum(stage["seconds"] for stage in counted),

@@ -233,10 +233,8 @@ def _joined(parts: list[np.ndarray], means, colors, left, stayed) -> list[np.nda
         apart = np.linalg.norm(np.median(colors[parts[i]], axis=0) - np.median(colors[parts[j]], axis=0))
         both = min(share_of(left[part], stayed[part]) for part in (parts[i], parts[j]))
         link[i, j] = touch and apart < _ALIKE and both > _OFF
-    labels = connected_components(csr_array(link), directed=False)[1]
-    return [
-        np.concatenate([p for p, label in zip(parts, labels, strict=True) if label == i]) for i in np.unique(labels)
-    ]
+    count, labels = connected_components(csr_array(link), directed=False)
+    return [np.concatenate([parts[i] for i in np.flatnonzero(labels == label)]) for label in range(count)]
 
 
 def _above(members: Int[np.ndarray, " m"], height, noise: float, config: TemplateConfig):
