@@ -28,6 +28,7 @@ from ltgs_jax.scene import (
 from .devices import mean_gradient, mesh_for, stacked
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
+from .schedule import Draws, Watch
 from .shadows import lay_blobs
 from .views import StreamedView, View, plan_for, scene_extent, size_of
 from .windows import Shown, Window, window_side, windows_of, within_change
@@ -35,8 +36,6 @@ from .windows import Shown, Window, window_side, windows_of, within_change
 _PRICE = 1e-3  # of a shadow's gain, as the slope of the loss
 _TILE = 8  # side in pixels of the squares that are held out
 _HELD_OUT = 1 / 16  # of the squares of every window of a later visit
-_FIRST = 0.5  # share of the first visit in what is replayed, where later ones were fitted before
-_PATIENCE = 0.3  # share of the passes that may, one after the other, come out no better than the best before
 
 
 @dataclass(frozen=True)
@@ -404,61 +403,38 @@ def _fit_windows(
     progress,
 ) -> tuple[_Variables, Float[np.ndarray, " s"]]:
     """The steps, each on windows drawn at random."""
-    later = [i for i, w in enumerate(windows) if w.visit >= since]
-    first = [i for i, w in enumerate(windows) if w.visit == 0]
-    seen = [i for i, w in enumerate(windows) if 0 < w.visit < since]
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
-    replayed = config.replay if first or seen else 0.0
+    draws = Draws(windows, since=since, replay=config.replay, rng=rng)
     mesh = mesh_for(config.batch)
-    steps = round(config.passes * len(later) / max(1 - replayed, 0.1) / config.batch)
-    steps = max(steps, 1) if later else 0
+    steps = draws.steps(config.passes, config.batch)
     losses = np.zeros(steps, np.float32)
     if steps == 0:
         progress(0, 1, "nothing that changed shows in any photograph: nothing is refined")
         return variables, losses
     dealt = "" if config.batch == 1 else f"; {config.batch} a step, on {mesh.size} of {jax.device_count()} devices"
-    told = f"{len(later)} windows of later visits, {len(first)} of the first"
-    progress(0, steps, told + (f", {len(seen)} fitted before" if seen else "") + dealt)
-    looks, plan_of = _looks(windows, rows, fixed, since, rng), partial(_plan, fixed=fixed)
-    state = adam().init(variables)
-    queues: dict[str, list[int]] = {"later": [], "first": [], "seen": []}
-
-    def draw() -> int:
-        name, every = "later", later
-        if rng.random() < replayed:
-            of_first = first and (not seen or rng.random() < _FIRST)
-            name, every = ("first", first) if of_first else ("seen", seen)
-        queue = queues[name]
-        if not queue:
-            queue.extend(rng.permutation(every).tolist())
-        return queue.pop()
-
-    plan = plan_of(variables, looks)
-    best, errors, error, drawn = jax.tree.map(np.array, variables), [np.inf], 0.0, 0
+    told = f"{len(draws.later)} windows of later visits, {len(draws.first)} of the first"
+    progress(0, steps, told + (f", {len(draws.seen)} fitted before" if draws.seen else "") + dealt)
+    looks = _looks(windows, rows, fixed, since, rng)
+    state, plan = adam().init(variables), _plan(variables, looks, fixed)
+    watch = Watch(variables, every=len(draws.later), passes=config.passes)
     for step in range(steps):
-        chosen = [draw() for _ in range(config.batch)]
+        chosen = [draws.draw() for _ in range(config.batch)]
         batch, united = _united([looks[i] for i in chosen], fixed.owner.shape[0])
         inputs = (fixed, batch, united, jnp.asarray(step / steps, jnp.float32))
         variables, state, loss, overflow = _step(inputs, variables, state, config, plan, mesh)
         losses[step], unseen = np.asarray(loss)
         if not np.isfinite(losses[step]):
             progress(step, steps, "the loss is not finite: stopped at the last good state")
-            return best, losses[:step]
+            return watch.best, losses[:step]
         if int(overflow) > 0:
-            plan = plan_of(variables, looks)
+            plan = _plan(variables, looks, fixed)
         if step % 100 == 0 or step == steps - 1:
             progress(step + 1, steps, f"loss {losses[max(0, step - 100) : step + 1].mean():.4f}")
-        error, drawn = error + config.batch * float(unseen), drawn + sum(windows[i].visit >= since for i in chosen)
-        if drawn < len(later):
-            continue
-        errors.append(error / drawn)
-        error, drawn = 0.0, 0
-        if errors[-1] == min(errors):
-            best = jax.tree.map(np.array, variables)
-        elif len(errors) - 1 - (least := int(np.argmin(errors))) >= _PATIENCE * config.passes:
-            text = f"what is held out came out best after {least} passes: stopped, and back to it"
+        held = sum(windows[i].visit >= since for i in chosen)
+        if watch.over(variables, error=config.batch * float(unseen), drawn=held):
+            text = f"what is held out came out best after {watch.passes} passes: stopped, and back to it"
             progress(step, steps, text)
-            return best, losses[: step + 1]
+            return watch.best, losses[: step + 1]
     return variables, losses
 
 

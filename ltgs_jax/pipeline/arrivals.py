@@ -173,12 +173,20 @@ def _place_known(
 ) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[tuple[Arrival, NewObject | None]]]:
     """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest, each
     as something new."""
-    placements = _placements(state, t, arrivals, front_end, eye=eye, config=config, rng=rng, progress=progress)
 
     @cache
     def as_new(i: int) -> NewObject | None:
         return _as_new(state, t, arrivals[i], observations, evidence, config=config, rng=rng)
 
+    def is_ground(i: int) -> bool:
+        new, arrival = as_new(i), arrivals[i]
+        explains = new is not None and config.template.tau_new <= new.gain <= _MOST
+        return explains and bool(_ground(state, t, arrival, new.template.splats[new.firm])[0])
+
+    # What may be ground is first looked at as that: for a known object it need not be searched.
+    doubted = [i for i, arrival in enumerate(arrivals) if arrival.bared > _BARED or arrival.light is not None]
+    things = [i for i in range(len(arrivals)) if i not in doubted or not is_ground(i)]
+    placements = _placements(state, t, arrivals, things, front_end, eye=eye, config=config, rng=rng, progress=progress)
     looked_at = dict(placements)
     for (i, k), found in _unsure(looked_at, config).items():
         new, others = as_new(i), [other for (j, m), other in looked_at.items() if j == i and m != k]
@@ -269,14 +277,17 @@ def crop_around(instance: Instance, observations, evidence: Evidence, size: int)
 
 
 def _placements(
-    state: State, t: int, arrivals: Sequence[Arrival], front_end: FrontEnd, *, eye: Eye, config: Config, rng, progress
-) -> dict[tuple[int, int], Placement]:
-    """Where each hidden template would stand as each arrival: the best few by search and matches, then settled."""
+    state: State, t: int, arrivals: Sequence[Arrival], things: Sequence[int], front_end: FrontEnd, *, eye: Eye,
+    config: Config, rng, progress,
+) -> dict[tuple[int, int], Placement]:  # fmt: skip
+    """Where each hidden template would stand as each arrival that may be a thing (`things`): the best few by search and
+    matches, then settled."""
     placements = {}
     matcher = Matcher(state, front_end, config)
     hidden = [k for k in range(len(state.chronology.templates)) if not bool(state.chronology.visible[t, k])]
     sizes = {k: template_diameter(state.chronology.templates[k].splats) for k in hidden}
-    for i, arrival in enumerate(arrivals):
+    for i in things:
+        arrival = arrivals[i]
         searches = _searches(state, t, arrival, sizes, matcher, eye=eye, config=config, rng=rng)
         ranked = sorted(searches, key=lambda k: -searches[k].best_gain)[: config.template.candidates]
         least = config.template.tau_gain
@@ -340,7 +351,7 @@ def _assigned(
         j = known.index(identities[k])
         cost[i, j], best[i, j] = -worth, k
     pairs = zip(*linear_sum_assignment(cost), strict=True) if count else ()
-    return [(i, best.get((i, j))) for i, j in pairs]
+    return [(int(i), best.get((i, j))) for i, j in pairs]
 
 
 def _as_new(
@@ -420,11 +431,7 @@ def _add_new(
     height = arrival.support.height(np.asarray(splats.means, np.float64))
     bared = arrival.bared > _BARED
     firm = splats[new.firm]
-    unshaded = _left_beside(state, t, np.asarray(firm.means, np.float64))
-    known = state.chronology.background
-    ground, shade = ground_shade(firm, arrival.support, known, bared=arrival.bared, unshaded=unshaded)
-    if arrival.light is not None:
-        ground, shade = True, arrival.light
+    ground, shade = _ground(state, t, arrival, firm)
     if ground or (ground is None and bared):
         if shade < 1 and not bared:
             progress.note(f"visit {t}: a shadow in {views} photographs, left out")
@@ -447,6 +454,16 @@ def _add_new(
     template = Template(firm, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
+
+
+def _ground(state: State, t: int, arrival: Arrival, firm: Splats) -> tuple[bool | None, float]:
+    """Whether what came, its firm splats as a new object, is the ground itself (None: unknown), and its brightness over
+    that of the ground around it."""
+    if arrival.light is not None:
+        return True, arrival.light
+    unshaded = _left_beside(state, t, np.asarray(firm.means, np.float64))
+    known = state.chronology.background
+    return ground_shade(firm, arrival.support, known, bared=arrival.bared, unshaded=unshaded)
 
 
 def _left_beside(state: State, t: int, points: Float[np.ndarray, "n 3"]) -> bool:
