@@ -1,5 +1,7 @@
 """What a visit's evidence is taken for: light or a thing, a burden or its foot, turned or as it stood."""
 
+import json
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -247,6 +249,20 @@ def test_colours_tell_nothing_where_another_object_has_them_too(state, rival, kn
     assert [m.identity for m in joined.chronology.templates] == [1, 2, 1 if known else 3]
     if not known:
         assert told[0].gain == 0.8
+
+
+@pytest.mark.parametrize(("others", "known"), [((), True), ((3,), True), ((1,), False)])
+def test_outlines_that_were_compared_and_are_others_outweigh_colours_and_shape(state, others, known):
+    for t in (1, 2, 3):
+        state = set_from(state, t, 0, visible=False)
+    stack = state.chronology.templates[0].splats
+    came = Template(transform_splats(_shifted(-0.5), stack), 2, 2)
+    after = add_template(state, came, np.zeros(stack.count, np.float32), _FLOOR, 2)
+    account = Account(1, "added", 0.8, 0.1, 3, other_than=others)
+    assert Account.from_json(json.loads(json.dumps(account.to_json()))) == account
+    joined, told = join_states(after, 2, [account])
+    assert [m.identity for m in joined.chronology.templates] == [1, 1 if known else 2]
+    assert told[0].gain == 0.8  # of all its colours; and where outlines speak against it, nothing is doubted
 
 
 def test_what_comes_as_new_with_the_colours_of_what_is_gone_is_doubted_where_no_shape_tells(state):

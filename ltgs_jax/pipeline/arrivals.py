@@ -1,5 +1,6 @@
 """What came in a visit: known templates at new poses, new objects, or ground that was hidden before."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import cache
 
@@ -86,6 +87,10 @@ class NewObject(eqx.Module):
     gain: float
 
 
+Unknown = tuple[Arrival, NewObject | None, tuple[int, ...]]
+"""What no known template explains, as something new, and the identities whose outlines it has not."""
+
+
 def place_arrivals(
     state: State,
     t: int,
@@ -124,15 +129,17 @@ def place_arrivals(
         ]
         found = [instance for instance in find_instances(cones, surface, config=config.match) if instance.views > 1]
         more = arrivals_of(found, after)
-        state, added, _, others = _place_known(state, t, gone, more, observations, after, front_end, **placing)
-        accounts, rest = accounts + added, rest + others
-    for arrival, new in rest:
+        state, added, _, left = _place_known(state, t, gone, more, observations, after, front_end, **placing)
+        accounts, rest = accounts + added, rest + left
+    for arrival, new, others in rest:
         after, account = _add_new(state, t, arrival, new, config, progress)
         shown = 1.0 if account is None else _shown(after, t, account.template, observations, eye=eye)
         if shown < _SHOWN:
             progress.note(f"visit {t}: a change left out, as a new object {shown:.2f} of it shows")
             continue
-        state, accounts = after, accounts + ([account] if account is not None else [])
+        state = after
+        if account is not None:
+            accounts = [*accounts, dataclasses.replace(account, other_than=others)]
     return state, accounts
 
 
@@ -170,9 +177,8 @@ def _place_known(
     config: Config,
     rng,
     progress,
-) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[tuple[Arrival, NewObject | None]]]:
-    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest, each
-    as something new."""
+) -> tuple[State, list[Account], list[tuple[Arrival, int]], list[Unknown]]:
+    """Hidden templates where they explain an arrival: the state, an account of each, which is which, and the rest."""
 
     @cache
     def as_new(i: int) -> NewObject | None:
@@ -187,7 +193,8 @@ def _place_known(
     doubted = [i for i, arrival in enumerate(arrivals) if arrival.bared > _BARED or arrival.light is not None]
     things = [i for i in range(len(arrivals)) if i not in doubted or not is_ground(i)]
     placements = _placements(state, t, arrivals, things, front_end, eye=eye, config=config, rng=rng, progress=progress)
-    looked_at = dict(placements)
+    looked_at, identities = dict(placements), [m.identity for m in state.chronology.templates]
+    unlike: dict[int, set[int]] = {i: set() for i in range(len(arrivals))}
     for (i, k), found in _unsure(looked_at, config).items():
         new, others = as_new(i), [other for (j, m), other in looked_at.items() if j == i and m != k]
         if new is None:
@@ -195,15 +202,15 @@ def _place_known(
         shape = _shape_beside(found, others, new, arrivals[i].crop, config)
         share = found.gain / min(max(new.gain, 1e-3), 1)
         if shape < config.template.tau_shape or share < config.template.tau_share:
-            identity = state.chronology.templates[k].identity
             what = f"outlines overlap by {shape:.2f}, and it explains {share:.2f} of what a new object would"
-            progress.note(f"visit {t}: arrival {i} is not object {identity}: their {what}")
+            progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: their {what}")
             del placements[i, k]
+            if shape < config.template.tau_shape:
+                unlike[i].add(identities[k])
     accounts, known, rest = [], [], []
-    identities = [m.identity for m in state.chronology.templates]
     for i, k in _assigned(len(arrivals), placements, identities, config):
         if k is None:
-            rest.append((arrivals[i], as_new(i)))
+            rest.append((arrivals[i], as_new(i), tuple(sorted(unlike[i]))))
             continue
         found = placements[i, k]
         state = set_from(state, t, k, visible=True, pose=found.world_from_template, unsure=config.detect.moved)

@@ -33,9 +33,10 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     In the place of what left at this visit, of its colours and another shape, it is a new state (section 3.2 of the
     LTGS paper: changed geometry). Elsewhere, of the colours and the shape of something that left now or before, it has
     moved, or is back, and shows sides that tell nothing of how it turned: its frame is that of the old template,
-    shifted. No other known object may have nearly as many colours in common with it. Only something new takes part. Of
-    several, pairs with the most colours in common. What stays new though it has colours of something hidden, and
-    nothing in its shape speaks against that, is less certain by their share.
+    shifted; unless its outlines were compared with those of what came, and are others. No other known object may have
+    nearly as many colours in common with it. Only something new takes part. Of several, pairs with the most colours in
+    common. What stays new though it has colours of something hidden, and nothing in its shape speaks against that, is
+    less certain by their share.
     """
     templates, visible = state.chronology.templates, np.asarray(state.chronology.visible)
     shown = {m.identity for k, m in enumerate(templates) if visible[t, k]}
@@ -50,7 +51,8 @@ def join_states(state: State, t: int, accounts: Sequence[Account]) -> tuple[Stat
     common = shared[[known.index(k) for k in hidden]]
     others = [[templates[o].identity != templates[k].identity for o in known] for k in hidden]
     rival = np.max(np.where(np.asarray(others)[..., None], shared, 0), axis=1)
-    distinct = common > _STANDS_OUT * rival
+    ruled_out = np.array([[templates[k].identity in a.other_than for a in came] for k in hidden])
+    distinct = (common > _STANDS_OUT * rival) & ~(ruled_out & ~in_place)
     # What has not changed its shape, and stands in its place, some pose of the old template explains.
     alike = distinct & np.where(in_place, ~one_shape & (common > _COMMON), one_shape & (common > _COMMON_ELSEWHERE))
     shapeless = np.array(

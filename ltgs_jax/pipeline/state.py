@@ -38,8 +38,9 @@ class State(eqx.Module):
 
 class Account(eqx.Module):
     """How one object was explained at one visit: kind, share of the change explained, what is left unlike the
-    photographs, over how many photographs, the axis [3] in its template's frame about which its turn is unknown, and
-    the evidence that proposed its pose, if one was sought."""
+    photographs, over how many photographs, the axis [3] in its template's frame about which its turn is unknown, the
+    evidence that proposed its pose, if one was sought, and the identities that the outlines of something new are not
+    those of."""
 
     template: int = eqx.field(static=True)
     kind: str = eqx.field(static=True)
@@ -48,6 +49,7 @@ class Account(eqx.Module):
     views: int = eqx.field(static=True)
     ambiguous_axis: tuple[float, ...] | None = eqx.field(static=True, default=None)
     evidence: str | None = eqx.field(static=True, default=None)
+    other_than: tuple[int, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def of_placed(cls, template: int, kind: str, found: Placement, views: int) -> "Account":
@@ -58,8 +60,8 @@ class Account(eqx.Module):
     @classmethod
     def from_json(cls, entry: dict) -> "Account":
         """What `to_json` gave."""
-        axis = entry.get("ambiguous_axis")
-        return cls(**{**entry, "ambiguous_axis": None if axis is None else tuple(axis)})
+        axis, others = entry.get("ambiguous_axis"), tuple(entry.get("other_than", ()))
+        return cls(**{**entry, "ambiguous_axis": None if axis is None else tuple(axis), "other_than": others})
 
     def to_json(self) -> dict:
         """As JSON holds it."""
@@ -71,6 +73,7 @@ class Account(eqx.Module):
             "views": self.views,
             "ambiguous_axis": self.ambiguous_axis,
             "evidence": self.evidence,
+            "other_than": self.other_than,
         }
 
 
