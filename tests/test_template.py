@@ -333,12 +333,10 @@ def test_a_template_is_found_where_it_stands_now():
     truth = SE3(jnp.asarray([np.cos(angle / 2), 0, 0, np.sin(angle / 2)], jnp.float32), jnp.asarray([0.12, 0.07, 0.0]))
     turned = eqx.tree_at(lambda s: s.means, template.splats, truth.apply(template.splats.means))
     crop = _crop(turned, 40)
-    config = TemplateConfig(search_splats=512)
-    place = np.array([[0.1, 0.1, 0.15]])
-    search = search_template(
-        template, support, support, place, crop, size=0.42, refiner=Refiner(), rng=rng, config=config
-    )
-    placement = settle_template(search, crop, size=0.42, refiner=Refiner())
+    looks = {"size": 0.42, "refiner": Refiner()}
+    options = {"rng": rng, "config": TemplateConfig(search_splats=512), **looks}
+    search = search_template(template, support, support, np.array([[0.1, 0.1, 0.15]]), crop, **options)
+    placement = settle_template(search, crop, **looks)
     error = placement.world_from_template.inverse() @ truth
     assert placement.gain > 0.8
     assert placement.overlap > 0.8
@@ -350,11 +348,10 @@ def test_a_template_is_found_where_it_stands_now():
     rough = SE3(truth.quat, truth.xyz + jnp.asarray([0.02, -0.015, 0.01])) @ SE3.exp(
         jnp.asarray([0, 0, 0, 0.1, 0, 0.1])
     )
-    options = {"size": 0.42, "refiner": Refiner(), "rng": rng, "config": config}
     lost = search_template(template, support, support, elsewhere, crop, **options)
     told = search_template(template, support, support, elsewhere, crop, matched={"matches": rough}, **options)
     assert lost.best_gain < 0.2 and lost.evidence == ("search", "search")
-    placement = settle_template(told, crop, size=0.42, refiner=Refiner())
+    placement = settle_template(told, crop, **looks)
     assert placement.evidence == "matches" and placement.gain > 0.8
 
 
