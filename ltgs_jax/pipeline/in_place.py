@@ -22,6 +22,7 @@ from .state import Account, State, came_to_place, scene_at, set_from
 _PARTLY = 0.06  # pixels that changed on and beside an object, per pixel of it, for it to be looked for at another turn
 _OFF = 1.0  # mean score, in deviations, of an object's pixels, too little for each, from which on the whole is doubted
 _BESIDE = 0.15  # width of what is beside it, in sides of a square as large
+_OF_FEW = 2.0  # times the margin by which a turn must look better, of what a few photographs of a later visit made
 _TURNED, _SHIFTED = np.radians(3), 0.03  # from where it stood, in radians and sizes, up to which a pose is the same
 
 
@@ -81,7 +82,8 @@ def turn_in_place(
             f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness "
             f"{found.error:.3f}; as it stood {still.error:.3f}"
         )
-        if not convincing(found, config) or found.error > still.error * (1 - config.template.still_margin):
+        margin = config.template.still_margin * (_OF_FEW if template.source_visit > 0 else 1)
+        if not convincing(found, config) or found.error > still.error * (1 - margin):
             continue
         pose = found.world_from_template
         if not _elsewhere(pose, before, template, size):
