@@ -11,6 +11,8 @@ import pytest
 from ltgs_jax.detect import ChangeMap
 from ltgs_jax.fit import View, VisitView
 from ltgs_jax.geometry import C0, SE3, Camera
+from ltgs_jax.match import Instance
+from ltgs_jax.pipeline import arrivals
 from ltgs_jax.pipeline.arrivals import _left_beside, convincing
 from ltgs_jax.pipeline.carried import carry_on
 from ltgs_jax.pipeline.config import Config
@@ -96,6 +98,28 @@ def test_bright_ground_is_ground_only_where_a_shadow_may_have_left():
     assert ground_shade(patch, _FLOOR, floor)[0] is False
     other = _box(rng, 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.004], (0.3, 0.5, 0.75))
     assert ground_shade(other, _FLOOR, floor, unshaded=True)[0] is False
+
+
+def test_what_is_light_or_ground_is_not_searched_for_known_objects_and_everything_is_tried_as_new_once(
+    state, monkeypatch
+):
+    rng = np.random.default_rng(1)
+    patch = _box(rng, 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.004], (0.6, 0.45, 0.3))
+    new = arrivals.NewObject(Template(patch, 2, 1), np.ones(60, bool), np.zeros((0, 4, 4), bool), 0.1, 1.0)
+    volume = Instance(np.asarray(patch.means, np.float64), (), 3)
+    light, ground, thing = (
+        arrivals.Arrival(volume, _FLOOR, None, None, bared, gain)
+        for bared, gain in ((0.0, 1.3), (0.9, None), (0.0, None))
+    )
+    tried, searched = [], []
+    monkeypatch.setattr(arrivals, "_as_new", lambda s, t, arrival, *a, **k: tried.append(arrival) or new)
+    monkeypatch.setattr(arrivals, "_searches", lambda s, t, arrival, *a, **k: searched.append(arrival) or {})
+    hidden = set_from(state, 1, 0, visible=False)
+    tools = {"eye": None, "config": Config(), "rng": rng, "progress": None}
+    _, accounts, known, rest = arrivals._place_known(hidden, 1, {}, [light, ground, thing], [], None, None, **tools)
+    assert searched == [thing]
+    assert tried == [light, ground, thing]
+    assert not accounts and not known and [arrival for arrival, _, _ in rest] == [light, ground, thing]
 
 
 def test_a_shadow_may_have_left_only_beside_where_something_stood(state):
