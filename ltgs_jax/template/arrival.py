@@ -32,7 +32,8 @@ from .locate import (
 )
 from .support import Support, Vantage, fit_support, rotation_about
 
-_TURNS = 12  # in place, of what was found
+_TURNS = 24  # in place, of what was found: a print is told from no further than some ten degrees
+_EVERY = 12  # turns that must explain a change as well for the turn to be unknown
 _ASIDE = 0.1  # of an object's size: half as far as a turn is tried to the sides of its place
 _WIDTH = np.r_[np.full(3, 0.02), np.full(3, 0.04)]  # in sizes and radians: where a pose is polished at first
 _ROUNDS = 6  # of polish
@@ -251,7 +252,7 @@ def _looks_alike(search: Search, pose: SE3, crop: Crop, size: float, refiner: Re
     """Whether a template explains the windows about as well at every other turn about the normal of what it stood on,
     lit as they show it: a plain cylinder does."""
     axis = np.asarray(pose.as_matrix(), np.float64)[:3, :3] @ search.stood_on.normal
-    turned = turned_round(pose, search.template, axis, _TURNS)
+    turned = turned_round(pose, search.template, axis, _EVERY)
     images, cover = refiner.images(search.template, turned, crop, 0.1 * size)
     gains = [
         explained(relit(image, shown, crop, freely=True), crop)[1] for image, shown in zip(images, cover, strict=True)
