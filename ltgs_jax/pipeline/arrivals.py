@@ -186,8 +186,9 @@ def _place_known(
 
     def is_ground(i: int) -> bool:
         new, arrival = as_new(i), arrivals[i]
-        explains = new is not None and config.template.tau_new <= new.gain <= _MOST
-        return explains and bool(_ground(state, t, arrival, new.template.splats[new.firm])[0])
+        if new is None or not _explains(new, config):
+            return False
+        return bool(_ground(state, t, arrival, new.template.splats[new.firm])[0])
 
     # What may be ground is first looked at as that: for a known object it need not be searched.
     doubted = [i for i, arrival in enumerate(arrivals) if arrival.bared > _BARED or arrival.light is not None]
@@ -430,7 +431,7 @@ def _add_new(
     """The state with a new template; ground that something had hidden joins the background instead."""
     if new is None:
         return state, None
-    if not config.template.tau_new <= new.gain <= _MOST:
+    if not _explains(new, config):
         progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
@@ -461,6 +462,11 @@ def _add_new(
     template = Template(firm, next_identity(state), t)
     state = add_template(state, template, errors, arrival.support, t)
     return state, Account(len(state.chronology.templates) - 1, "added", new.gain, new.error, views)
+
+
+def _explains(new: NewObject, config: Config) -> bool:
+    """Whether a new object explains as much of the change as it must, and no more than there is."""
+    return config.template.tau_new <= new.gain <= _MOST
 
 
 def _ground(state: State, t: int, arrival: Arrival, firm: Splats) -> tuple[bool | None, float]:
