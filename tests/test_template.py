@@ -22,7 +22,16 @@ from ltgs_jax.template import (
     search_template,
     settle_template,
 )
-from ltgs_jax.template.arrival import Search, levelled, middle_of, pose_hypotheses, shown_points, thin, tilts_of
+from ltgs_jax.template.arrival import (
+    Search,
+    levelled,
+    middle_of,
+    place_template,
+    pose_hypotheses,
+    shown_points,
+    thin,
+    tilts_of,
+)
 from ltgs_jax.template.consistency import surface_evidence
 from ltgs_jax.template.cut import neighbour_graph, random_walk
 from ltgs_jax.template.locate import freedoms_of, relit
@@ -384,12 +393,13 @@ def test_relit_takes_out_shade_and_not_print():
     points, colors = _box(np.random.default_rng(5))
     crop = _crop(_splats(points, colors, 0.015), 40)
     target, cover = np.asarray(crop.target), np.asarray(crop.region, float)
-    ramp = np.exp(np.linspace(-0.4, 0.3, 40))[None, None, :, None]
-    shaded = np.where(cover[..., None] > 0, np.clip(target / ramp, 0, 1), target)
-    lit = relit(shaded, cover, crop)
     inside = cover > 0
-    assert np.abs(lit - target)[inside].mean() < 0.5 * np.abs(shaded - target)[inside].mean()
-    np.testing.assert_array_equal(lit[~inside], shaded[~inside])
+    rows, columns = np.mgrid[-1:1:40j, -1:1:40j]
+    for log_gain, left in ((0.35 * columns - 0.05, 0.2), (0.3 - 1.5 * (rows**2 + columns**2), 0.25)):
+        shaded = np.where(inside[..., None], np.clip(target / np.exp(log_gain)[..., None], 0, 1), target)
+        lit = relit(shaded, cover, crop)
+        assert np.abs(lit - target)[inside].mean() < left * np.abs(shaded - target)[inside].mean()
+        np.testing.assert_array_equal(lit[~inside], shaded[~inside])
     wrong = np.where(inside[..., None], target[:, :, ::-1], target)
     assert np.abs(relit(wrong, cover, crop) - target)[inside].mean() > 0.8 * np.abs(wrong - target)[inside].mean()
 
@@ -417,6 +427,34 @@ def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
     error = found.world_from_template.inverse() @ truth
     assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(15)
     assert found.ambiguous_axis is None
+
+
+def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade():
+    rng = np.random.default_rng(11)
+    normals = rng.normal(size=(4000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = 0.1 * normals + [0.0, 0.0, 0.1]
+    spots = rng.normal(size=(12, 3))
+    spots /= np.linalg.norm(spots, axis=1, keepdims=True)
+    printed = np.where((normals @ spots.T).max(axis=1)[:, None] > 0.88, [0.8, 0.35, 0.25], [0.3, 0.4, 0.6])
+
+    def lit(outward):
+        return printed * (0.75 + 0.35 * outward @ [0.8, 0.0, 0.6])[:, None]
+
+    template = Template(_splats(points, lit(normals), 0.006), 1, 0)
+    truth = _turned(np.radians(140), [0.12, 0.07, 0.0])
+    outward = np.asarray(truth.apply(jnp.asarray(normals))) - np.asarray(truth.xyz)
+    crop = _crop(_splats(np.asarray(truth.apply(template.splats.means)), lit(outward), 0.006), 56)
+    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    wrong = _turned(np.radians(20), [0.12, 0.07, 0.0])
+    search = Search(template.splats, support, support, wrong[None], np.zeros(1), 1.0, 1.0)
+    found = settle_template(search, crop, size=0.35, refiner=refiner)
+    error = found.world_from_template.inverse() @ truth
+    assert float(rotation_angle(error.quat / jnp.linalg.norm(error.quat))) < np.radians(5)
+    truly, as_it_stood = (
+        place_template(search, pose, crop, size=0.35, refiner=refiner, lit=True) for pose in (truth, wrong)
+    )
+    assert truly.error < 0.8 * as_it_stood.error
 
 
 def test_the_turn_of_a_plain_cylinder_is_not_known_and_its_axis_is_named():

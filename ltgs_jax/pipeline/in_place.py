@@ -11,7 +11,7 @@ from ltgs_jax.fit import template_diameter
 from ltgs_jax.geometry import SE3, rotation_angle
 from ltgs_jax.match import Instance
 from ltgs_jax.scene import Template
-from ltgs_jax.template import middle_of, place_template, search_template, settle_template
+from ltgs_jax.template import middle_of, nudged, place_template, search_template, settle_template
 
 from .arrivals import convincing, crop_around
 from .config import Config
@@ -76,16 +76,20 @@ def turn_in_place(
         if search.best_gain < config.template.tau_gain:
             continue
         found = settle_template(search, crop, size=size, refiner=eye.refiner)
-        still = place_template(search, before, crop, size=size, refiner=eye.refiner)
+        pose, looks = found.world_from_template, {"size": size, "refiner": eye.refiner}
+        # Another turn is compared with the best pose about as it stood; that with the very pose.
+        about = nudged(search, before, crop, **looks)
+        rival = about if _elsewhere(pose, about, template, size) else before
+        # Lit alike: the shade in its splats turns with it, and that of the room does not.
+        turned, still = (place_template(search, p, crop, lit=True, **looks) for p in (pose, rival))
         progress.note(
             f"visit {t}: object {template.identity} turned or nudged explains {found.gain:.2f}, outline "
-            f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness "
-            f"{found.error:.3f}; as it stood {still.error:.3f}"
+            f"{found.overlap:.2f}, likeness {found.likeness:.2f}, recall {found.recall:.2f}, unlikeness, lit, "
+            f"{turned.error:.3f}; as it stood {still.error:.3f}"
         )
         margin = config.template.still_margin * (_OF_FEW if template.source_visit > 0 else 1)
-        if not convincing(found, config) or found.error > still.error * (1 - margin):
+        if not convincing(found, config) or turned.error > still.error * (1 - margin):
             continue
-        pose = found.world_from_template
         if not _elsewhere(pose, before, template, size):
             continue
         trial = set_from(hidden, t, k, visible=True, pose=pose, unsure=config.detect.moved)

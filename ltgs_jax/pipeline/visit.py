@@ -114,8 +114,9 @@ def explain_visit(
         state, t, gone, instances, observations, evidence, bared, surface, front_end, **tools
     )
     accounts += turned
+    unsettled = sorted(set(gone) - {a.template for a in turned})
     state, accounts = _put_back(
-        state, t, gone, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
+        state, t, unsettled, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
     state, accounts = join_states(state, t, accounts)
     state = _learn_errors(state, t, accounts, observations, front_end, eye, config)
@@ -131,7 +132,7 @@ def _strength(instance: Instance, evidence: Evidence) -> float:
 
 
 def _put_back(
-    state: State, t: int, gone: dict[int, float], remnants: Sequence[Remnant], accounts: list[Account], known: int,
+    state: State, t: int, gone: Sequence[int], remnants: Sequence[Remnant], accounts: list[Account], known: int,
     observations, *, eye, config, progress,
 ) -> tuple[State, list[Account]]:  # fmt: skip
     """What left stays after all where the photographs like the scene with it as well: still is cheaper than moved.
@@ -149,7 +150,7 @@ def _put_back(
         return hidden or stayed <= left * (1 + config.template.still_margin), left, stayed, others
 
     back = []
-    for k in sorted(gone):
+    for k in gone:
         alternative = set_from(state, t, k, visible=True, pose=state.chronology.world_from_template[t - 1, k])
         stays, left, stayed, others = judged(alternative)
         if stays:

@@ -4,6 +4,7 @@ from .arrival import Placement as Placement
 from .arrival import Search as Search
 from .arrival import build_template as build_template
 from .arrival import middle_of as middle_of
+from .arrival import nudged as nudged
 from .arrival import place_template as place_template
 from .arrival import search_template as search_template
 from .arrival import settle_template as settle_template

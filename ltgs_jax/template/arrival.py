@@ -222,8 +222,8 @@ def search_template(
 
 
 def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner) -> Placement:
-    """Refine the poses of a search on the pixels, in all six freedoms, and the two best turns in place of what comes of
-    it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. Of the three the one
+    """Refine the poses of a search on the pixels, in all six freedoms, and the best turns in place of what comes of
+    it: cartons, mugs and bottles look alike from several sides, which coarse windows do not tell. Of these the one
     with the most evidence when lit as the photographs show it: shade weighs as much as detail in the error, and it
     stays where it is when an object turns. It stands upright, as it stood, unless the pixels clearly say that it leans.
     """
@@ -231,19 +231,18 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     best = int(np.argmin(found.errors))
     first, evidence = found.poses[best], search.evidence[best]
     turned = _other_turns(search, first, crop, size=size, refiner=refiner)
-    half = _ROUNDS // 2
-    poses = [_polished(search, pose, None, crop, size, refiner, half)[0] for pose in (first, turned[0], turned[1])]
+    poses = [nudged(search, pose, crop, size=size, refiner=refiner) for pose in (first, *turned)]
     lit = [place_template(search, pose, crop, size=size, refiner=refiner, lit=True) for pose in poses]
     likeliest = max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))
     chosen, evidence = poses[likeliest], evidence if likeliest == 0 else SEARCH
-    chosen, _ = _polished(search, chosen, None, crop, size, refiner, _ROUNDS - half, width=_FINER)
-    best = place_template(search, chosen, crop, size=size, refiner=refiner)
+    chosen, least = _polished(search, chosen, None, crop, size, refiner, _ROUNDS // 2, width=_FINER)
     points = shown_points(search.template)
-    upright = levelled(best.world_from_template, points, search.stood_on, search.stands_on)
+    upright = levelled(chosen, points, search.stood_on, search.stands_on)
     if upright is not None:
-        pose, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
-        if error <= best.error * (1 + _LEVEL_MARGIN):
-            best = place_template(search, pose, crop, size=size, refiner=refiner)
+        upright, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
+        if error <= least * (1 + _LEVEL_MARGIN):
+            chosen = upright
+    best = place_template(search, chosen, crop, size=size, refiner=refiner)
     axis = search.stood_on.normal if _looks_alike(search, best.world_from_template, crop, size, refiner) else None
     return dataclasses.replace(best, ambiguous_axis=axis, evidence=evidence)
 
@@ -254,24 +253,28 @@ def _looks_alike(search: Search, pose: SE3, crop: Crop, size: float, refiner: Re
     axis = np.asarray(pose.as_matrix(), np.float64)[:3, :3] @ search.stood_on.normal
     turned = turned_round(pose, search.template, axis, _EVERY)
     images, cover = refiner.images(search.template, turned, crop, 0.1 * size)
-    gains = [
-        explained(relit(image, shown, crop, freely=True), crop)[1] for image, shown in zip(images, cover, strict=True)
-    ]
+    gains = [explained(relit(image, shown, crop), crop)[1] for image, shown in zip(images, cover, strict=True)]
     return min(gains) > _ALIKE * max(gains[0], 0)
 
 
 def _polished(
     search: Search, pose: SE3, turning, crop: Crop, size: float, refiner: Refiner, rounds: int, *, width: float = 1.0
 ) -> tuple[SE3, float]:
-    """A pose [] where the unlikeness is least nearby, and that."""
+    """A pose [] where the unlikeness, lit as the photographs show it, is least nearby, and that."""
     freedoms = freedoms_of(turning) * (width * _WIDTH * np.r_[np.full(3, size), np.ones(3)])[:, None]
     found = refiner.polish(search.template, pose[None], crop, freedoms, tolerance=0.1 * size, rounds=rounds)
     return found.poses[0], float(found.errors[0])
 
 
-def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> SE3:
-    """The two best other turns of a pose about the surface's normal that are better than those next to them, each where
-    it fits best: what is to one side of an object's axis, as a handle, is to the other when it has turned.
+def nudged(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> SE3:
+    """A pose [] of a search's template moved to where it looks most like the windows nearby, lit as they show it."""
+    return _polished(search, pose, None, crop, size, refiner, _ROUNDS // 2)[0]
+
+
+def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner: Refiner) -> list[SE3]:
+    """The best other turns of a pose [] about the surface's normal, two at most, of those that are better than the ones
+    next to them, each where it fits best: what is to one side of an object's axis, as a handle, is to the other when it
+    has turned.
     """
     tolerance, axes = 0.1 * size, search.stands_on.frame()
     turns = turned_round(pose, search.template, search.stands_on.normal, _TURNS)
@@ -279,14 +282,15 @@ def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner:
     shifts = 2 * _ASIDE * size * np.stack([np.zeros(3), *ring])
     places = (np.asarray(turns.xyz)[:, None] + shifts).reshape(-1, 3)
     every = SE3(jnp.repeat(turns.quat, len(shifts), axis=0), jnp.asarray(places, jnp.float32))
-    errors = refiner.score(search.template, every, crop, tolerance=tolerance)[0].reshape(_TURNS, -1)
+    errors = refiner.score(search.template, every, crop, tolerance=tolerance, lit=True)[0].reshape(_TURNS, -1)
     nearest = every[np.arange(_TURNS) * len(shifts) + errors.argmin(axis=1)]
     along = np.zeros((6, 2))
     along[:3] = _ASIDE * size * search.stood_on.frame()[:2].T
     fitted = refiner.polish(search.template, nearest, crop, along, tolerance=tolerance, rounds=3)
     least = fitted.errors
-    dips = (least <= np.roll(least, 1)) & (least <= np.roll(least, -1))
-    return fitted.poses[1 + np.argsort(np.where(dips, least, least + 1)[1:], kind="stable")[:2]]
+    dips = np.flatnonzero((least <= np.roll(least, 1)) & (least <= np.roll(least, -1)))
+    others = dips[dips > 0]
+    return [fitted.poses[i] for i in others[np.argsort(least[others], kind="stable")[:2]]]
 
 
 def shown_points(splats: Splats) -> Float[np.ndarray, "n 3"]:

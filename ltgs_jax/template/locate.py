@@ -128,7 +128,7 @@ _BEAM = ((32, 4), (16, 8), (8, 8), (6, 10), (6, 10), (6, 10))  # poses that a se
 _AS_GOOD = 0.05  # unlikeness by which a pixel may be worse and still count as no worse
 _WRONG = 0.5  # unlikeness from which on a pixel is clearly not explained
 _CAP = 0.3  # colour error at which a pixel is simply wrong, however wrong
-_DARK, _TIMID, _GAIN = 0.05, 0.05, 0.7  # floor of ratios of colours; prior of a gain on nothing, and its most, in log
+_DARK, _TIMID, _GAIN = 0.05, 1e-4, 0.7  # floor of ratios of colours; prior of a gain on nothing, and its most, in log
 _SCALE = 0.15  # of a residual, beyond which it counts for little
 _BLUR, _LOCAL = 1.5, 3.0  # pixels: of a descent's first steps; of the mean that greys lose
 _NARROWER = 0.7  # what is left of the width of parabolas from round to round
@@ -177,26 +177,25 @@ def likeness(images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s
     return float(np.median(means))
 
 
+@eqx.filter_jit
 def relit(
-    images: Float[np.ndarray, "v s s 3"], cover: Float[np.ndarray, "v s s"], crop: Crop, *, freely: bool = False
-) -> Float[np.ndarray, "v s s 3"]:
-    """Composites with the template lit as the photographs show it: in each view a gain on what it covers, log-linear
-    over the window (log-quadratic, and without restraint, if `freely`), fitted to the photograph. A print that is wrong
-    stays wrong; a shade that turned with the object does not."""
-    target, grey = np.asarray(crop.target).mean(axis=-1), images.mean(axis=-1)
+    images: Float[Array, "v s s 3"], cover: Float[Array, "v s s"], crop: Crop, strength: Float[Array, ""] | float = 1.0
+) -> Float[Array, "v s s 3"]:
+    """Composites with the template lit as the photographs show it: in each view a gain on what it covers,
+    log-quadratic over the window, fitted to the photograph. A print that is wrong stays wrong; a shade that turned with
+    the object does not, a ball's included, which no log-linear gain takes out. `strength` 0: left as they are."""
+    target, grey = jnp.mean(crop.target, axis=-1), jnp.mean(images, axis=-1)
     rows, columns = np.mgrid[-1 : 1 : 1j * grey.shape[1], -1 : 1 : 1j * grey.shape[2]]
-    linear = [np.ones_like(rows), columns, rows]
-    basis = np.stack(linear + [columns**2, columns * rows, rows**2] * freely, axis=-1)
-    prior = (1e-4 if freely else _TIMID) * np.eye(basis.shape[-1])
-    shown = (cover > 0.5) & np.asarray(crop.valid)
-    lit = []
-    for image, g, t, c, mask in zip(images, grey, target, cover, shown, strict=True):
-        wanted = np.clip(np.log((t[mask] + _DARK) / (g[mask] + _DARK)), -1, 1)
-        near = basis[mask]
-        system = near.T @ near + max(len(near), 1) * prior
-        gain = np.exp(np.clip(basis @ np.linalg.solve(system, near.T @ wanted), -_GAIN, _GAIN))
-        lit.append(image * (1 + c * (gain - 1))[..., None])
-    return np.stack(lit)
+    basis = np.stack([np.ones_like(rows), columns, rows, columns**2, columns * rows, rows**2], axis=-1)
+    basis = jnp.asarray(basis, images.dtype).reshape(-1, basis.shape[-1])
+    shown = ((cover > 0.5) & crop.valid).reshape(len(images), -1)
+    wanted = jnp.clip(jnp.log((target + _DARK) / (grey + _DARK)), -1, 1).reshape(shown.shape)
+    near = shown[..., None] * basis
+    prior = _TIMID * jnp.maximum(jnp.sum(shown, axis=1), 1)
+    system = jnp.einsum("vpi,pj->vij", near, basis) + prior[:, None, None] * jnp.eye(basis.shape[-1])
+    fitted = jnp.linalg.solve(system, jnp.einsum("vpi,vp->vi", near, wanted)[..., None])[..., 0]
+    gain = jnp.exp(strength * jnp.clip(jnp.einsum("pi,vi->vp", basis, fitted), -_GAIN, _GAIN)).reshape(cover.shape)
+    return images * (1 + cover * (gain - 1))[..., None]
 
 
 def backdrop_error(crop: Crop) -> tuple[float, float]:
@@ -238,9 +237,11 @@ def _composites(template: Splats, poses: SE3, crop: Crop, tolerance, plan: Rende
 
 
 @eqx.filter_jit
-def _judged(template: Splats, poses: SE3, crop: Crop, tolerance, plan: RenderPlan):
-    """Mean unlikeness at each of m poses, how many of the pixels that changed the template covers there, overflow."""
+def _judged(template: Splats, poses: SE3, crop: Crop, tolerance, strength, plan: RenderPlan):
+    """Mean unlikeness at each of m poses, lit as the photographs show it to this strength, how many of the pixels that
+    changed the template covers there, overflow."""
     images, cover, overflow = _composites(template, poses, crop, tolerance, plan)
+    images = jax.vmap(relit, (0, 0, None, None))(images, cover, crop, strength)
     wrong = jax.vmap(unlikeness, (0, None, None))(images, crop.target, crop.valid)
     return _mean_errors(wrong, crop), jnp.sum(cover * (crop.valid & crop.region), axis=(1, 2, 3)), overflow
 
@@ -346,14 +347,15 @@ class Refiner:
         return self._shown(_composites, template, poses, crop, tolerance)
 
     def score(
-        self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float
+        self, template: Splats, poses: SE3, crop: Crop, *, tolerance: float, lit: bool = False
     ) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
-        """Mean unlikeness at each of m poses, rendered in batches, and how many of the pixels that changed it covers
-        there."""
+        """Mean unlikeness at each of m poses, rendered in batches (`lit` as the photographs show it), and how many of
+        the pixels that changed it covers there."""
         few = poses.xyz.shape[0] <= _BATCH or jax.default_backend() == "cpu"
         step = _BATCH if few else _AT_ONCE * _BATCH
         poses, starts = jax.tree.map(np.asarray, poses), range(0, poses.xyz.shape[0], step)
-        parts = [self._shown(_judged, template, poses[i : i + step], crop, tolerance) for i in starts]
+        strength = jnp.asarray(lit, jnp.float32)
+        parts = [self._shown(_judged, template, poses[i : i + step], crop, tolerance, strength) for i in starts]
         errors, covered = (np.concatenate(part) for part in zip(*parts, strict=True))
         return errors, covered
 
@@ -481,8 +483,9 @@ class Refiner:
         tolerance: float,
         rounds: int,
     ) -> Refinement:
-        """Each of m poses moved to where the unlikeness itself is least: the residuals of a descent also pull towards
-        where the shade of a template agrees. `freedoms`: what may change, tangents as wide as the first round looks.
+        """Each of m poses moved to where the unlikeness itself, lit as the photographs show it, is least: the residuals
+        of a descent also pull towards where the shade of a template agrees. `freedoms`: what may change, tangents as
+        wide as the first round looks.
 
         A round takes the unlikeness on both sides along each freedom and goes to the vertices of the parabolas; each
         round looks less wide.
@@ -495,7 +498,7 @@ class Refiner:
         for width in _NARROWER ** np.arange(rounds):
             around = jax.tree.map(lambda leaf: jnp.repeat(jnp.asarray(leaf), len(probes), axis=0), center)
             around = _about(middle, around, np.tile(width * probes, (m, 1)))
-            errors = self.score(template, around, crop, tolerance=tolerance)[0].reshape(m, -1)
+            errors = self.score(template, around, crop, tolerance=tolerance, lit=True)[0].reshape(m, -1)
             lost, least = errors[:, 0] > best_errors, errors.argmin(axis=1)
             better = errors[each, least] < best_errors
             best = _where(better, jax.tree.map(np.asarray, around[each * len(probes) + least]), best)
