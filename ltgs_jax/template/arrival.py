@@ -242,9 +242,9 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
         upright, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
         if error <= least * (1 + _LEVEL_MARGIN):
             chosen = upright
-    best = place_template(search, chosen, crop, size=size, refiner=refiner)
-    axis = search.stood_on.normal if _looks_alike(search, best.world_from_template, crop, size, refiner) else None
-    return dataclasses.replace(best, ambiguous_axis=axis, evidence=evidence)
+    placed = place_template(search, chosen, crop, size=size, refiner=refiner)
+    axis = search.stood_on.normal if _looks_alike(search, chosen, crop, size, refiner) else None
+    return dataclasses.replace(placed, ambiguous_axis=axis, evidence=evidence)
 
 
 def _looks_alike(search: Search, pose: SE3, crop: Crop, size: float, refiner: Refiner) -> bool:
