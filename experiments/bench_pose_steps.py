@@ -29,7 +29,7 @@ from ltgs_jax.fit.chronology import placements_of
 from ltgs_jax.geometry import SE3
 from ltgs_jax.io import load_chronology
 from ltgs_jax.metrics import rotation_deg, translation_rel
-from ltgs_jax.pipeline.evaluate import read_truth
+from ltgs_jax.pipeline.evaluate import middle_and_size, read_truth, true_motion
 from ltgs_jax.pipeline.looks import Eye
 from ltgs_jax.pipeline.state import composed
 from ltgs_jax.register.photometric import PhotometricConfig, Views, refine_pose
@@ -109,22 +109,17 @@ def pose_errors(chronology: Chronology, truth: dict) -> tuple[float, float]:
     for k, template in enumerate(chronology.templates):
         if template.source_visit > 0:
             continue
-        middle = middle_of(np.asarray(template.splats.means, np.float64))
-        apart = {}
-        for name, matrix in truth["times"][0].items():
-            start, extents = np.asarray(matrix, float), np.asarray(truth["extents"][name], float)
-            center = start[:3, :3] @ [0, 0, extents[2] / 2] + start[:3, 3]
-            apart[name] = np.linalg.norm(center - middle) / np.linalg.norm(extents), start, center, extents
-        name = min(apart, key=lambda n: apart[n][0])
-        _, start, center, extents = apart[name]
+        shown = middle_of(np.asarray(template.splats.means, np.float64))
+        places = {name: middle_and_size(truth, name, 0) for name in truth["times"][0]}
+        name = min(places, key=lambda n: np.linalg.norm(places[n][0] - shown) / places[n][1])
+        middle, size = places[name]
         for t in range(1, len(chronology.visits)):
-            goal = truth["times"][t].get(name)
-            if goal is None or not bool(chronology.visible[t, k]) or np.allclose(goal, start, atol=1e-6):
+            motion = true_motion(truth, name, 0, t)
+            if motion is None or not bool(chronology.visible[t, k]):
                 continue
-            motion = SE3.from_matrix(jnp.asarray(np.asarray(goal) @ np.linalg.inv(start), jnp.float32))
             pose = chronology.world_from_template[t, k]
             turns.append(rotation_deg(pose, motion))
-            shifts.append(translation_rel(pose, motion, center=center, size=float(np.linalg.norm(extents))))
+            shifts.append(translation_rel(pose, motion, center=middle, size=size))
     return float(np.median(turns)), float(np.median(shifts))
 
 

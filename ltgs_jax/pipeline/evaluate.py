@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ltgs_jax.detect import dilate
 from ltgs_jax.geometry import SE3, Camera
@@ -119,6 +119,20 @@ def changed_names(truth: dict, a: int, b: int) -> set[str]:
     }
 
 
+def middle_and_size(truth: dict, name: str, t: int) -> tuple[Float[np.ndarray, "3"], float]:
+    """The middle of an object's box at visit t, and the diagonal of that box, in scene units."""
+    pose, extents = _poses(truth, t)[name], np.asarray(truth["extents"][name], float)
+    return pose[:3, :3] @ [0, 0, extents[2] / 2] + pose[:3, 3], float(np.linalg.norm(extents))
+
+
+def true_motion(truth: dict, name: str, a: int, b: int) -> SE3 | None:
+    """How an object moved between visits a and b, in the world; None where it is not there at b, or stands as at a."""
+    start, goal = _poses(truth, a)[name], _poses(truth, b).get(name)
+    if goal is None or np.allclose(goal, start, atol=1e-6):
+        return None
+    return SE3.from_matrix(jnp.asarray(goal @ np.linalg.inv(start), jnp.float32))
+
+
 def _changed_region(out: Path, entry: dict, truth, camera: Camera, rendered, untouched) -> Bool[np.ndarray, "h w"]:
     """Pixels of a photograph in which the scene is not that of the first visit."""
     t = entry["visit"]
@@ -174,21 +188,15 @@ def _truth_scores(out: Path, capture, tracks: dict, truth: dict, manifest: list[
         source = item["source_visit"]
         if name is None or name not in truth["times"][source]:
             continue
-        start = _poses(truth, source)[name]
-        extents = np.asarray(truth["extents"][name], float)
-        center = start[:3, :3] @ [0, 0, extents[2] / 2] + start[:3, 3]
         for state in item["states"]:
-            t = state["visit"]
-            if not state["visible"] or name not in truth["times"][t] or t <= source:
+            motion = true_motion(truth, name, source, state["visit"])
+            if not state["visible"] or state["visit"] <= source or motion is None:
                 continue
-            goal = _poses(truth, t)[name]
-            if np.allclose(goal, start, atol=1e-6):
-                continue
-            motion = SE3.from_matrix(jnp.asarray(goal @ np.linalg.inv(start), jnp.float32))
             pose = state["world_from_template"]
             mine = SE3(jnp.asarray(pose["wxyz"], jnp.float32), jnp.asarray(pose["xyz"], jnp.float32))
+            middle, size = middle_and_size(truth, name, source)
             rotations.append(rotation_deg(mine, motion))
-            translations.append(translation_rel(mine, motion, center=center, size=float(np.linalg.norm(extents))))
+            translations.append(translation_rel(mine, motion, center=middle, size=size))
     if rotations:
         rows.append(metric("rotation_deg", float(np.median(rotations)), visit=None).to_json())
         rows.append(metric("translation_rel", float(np.median(translations)), visit=None).to_json())
@@ -203,10 +211,9 @@ def _assign_by_place(tracks: dict, truth: dict, assignment: dict[int, int]) -> d
         if item["id"] in assignment or item["source_visit"] != 0:
             continue
         best, nearest = None, 0.5
-        for name, pose in _poses(truth, 0).items():
-            extents = np.asarray(truth["extents"][name], float)
-            middle = pose[:3, :3] @ [0, 0, extents[2] / 2] + pose[:3, 3]
-            distance = np.linalg.norm(np.asarray(item["center"]) - middle) / np.linalg.norm(extents)
+        for name in _poses(truth, 0):
+            middle, size = middle_and_size(truth, name, 0)
+            distance = np.linalg.norm(np.asarray(item["center"]) - middle) / size
             if distance < nearest and truth["ids"][name] not in taken:
                 best, nearest = truth["ids"][name], distance
         if best is not None:

@@ -107,10 +107,8 @@ def pose_hypotheses(
     center = middle_of(template)
     stood = stood_on.height(center[None])[0]
     align = rotation_between(stood_on.normal, stands_on.normal)
-    axes = stands_on.frame()
-    ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
     widths = (0.35, 0.8) if len(places) == 1 else (0.35,)
-    around = np.stack([np.zeros(3), *[width * spread * r for width in widths for r in ring]])
+    around = np.concatenate([np.zeros((1, 3)), *[width * spread * stands_on.ring() for width in widths]])
     matrices = []
     for tilt in tilts:
         for turn in range(turns):
@@ -276,10 +274,9 @@ def _other_turns(search: Search, pose: SE3, crop: Crop, *, size: float, refiner:
     next to them, each where it fits best: what is to one side of an object's axis, as a handle, is to the other when it
     has turned.
     """
-    tolerance, axes = 0.1 * size, search.stands_on.frame()
+    tolerance = 0.1 * size
     turns = turned_round(pose, search.template, search.stands_on.normal, _TURNS)
-    ring = [np.cos(a) * axes[0] + np.sin(a) * axes[1] for a in np.arange(6) * np.pi / 3]
-    shifts = 2 * _ASIDE * size * np.stack([np.zeros(3), *ring])
+    shifts = 2 * _ASIDE * size * np.concatenate([np.zeros((1, 3)), search.stands_on.ring()])
     places = (np.asarray(turns.xyz)[:, None] + shifts).reshape(-1, 3)
     every = SE3(jnp.repeat(turns.quat, len(shifts), axis=0), jnp.asarray(places, jnp.float32))
     errors = refiner.score(search.template, every, crop, tolerance=tolerance, lit=True)[0].reshape(_TURNS, -1)

@@ -37,6 +37,11 @@ class Support(eqx.Module):
         u /= np.linalg.norm(u)
         return np.stack([u, np.cross(self.normal, u), self.normal])  # right-handed
 
+    def ring(self) -> Float[np.ndarray, "6 3"]:
+        """Six unit vectors in the plane, all around."""
+        u, v, _ = self.frame()
+        return np.stack([np.cos(a) * u + np.sin(a) * v for a in np.arange(6) * np.pi / 3])
+
 
 class Vantage(eqx.Module):
     """Where a visit's photographs were taken from: camera centres, and which way is up, as a unit vector."""
