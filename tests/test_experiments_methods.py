@@ -11,6 +11,7 @@ import pytest
 
 from experiments import report, tables
 from experiments.baselines.method import MethodConfig
+from experiments.baselines.system import confidence_of
 from experiments.captures import CaptureConfig, open_capture
 from experiments.engine import MACHINE, Run, read_table, run_all
 from experiments.scenes import Answer, SceneConfig, bytes_of, load_problem, score
@@ -69,6 +70,12 @@ def test_empty_slots_weigh_nothing():
 
 
 @pytest.mark.slow
+def test_where_nothing_happens_nothing_is_said_of_confidence():
+    states = [{"event": "moved", "confidence": 0.4}, {"event": "still", "confidence": 1.0}]
+    assert confidence_of({"objects": [{"states": states}]}) == {"confidence": 0.4}
+    assert confidence_of({"objects": [{"states": states[1:]}]}) == {} == confidence_of({"objects": []})
+
+
 def test_noise_moves_only_the_poses_that_methods_use(tmp_path):
     plain = read_capture(open_capture(SMALL.capture, tmp_path))
     noisy = read_capture(open_capture(dataclasses.replace(SMALL.capture, pose_noise=1.0), tmp_path))

@@ -99,8 +99,7 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
     scenes = [drop_hidden(compose(chronology, t)) for t in range(len(problem.visits))]
     said |= {"templates": len(chronology.templates), "splats": sum(t.splats.count for t in chronology.templates)}
     said["splats"] += chronology.background.count
-    events = [s for each in read_tracks(out / "tracks.json")["objects"] for s in each["states"]]
-    said["confidence"] = mean(s["confidence"] for s in events if s["event"] not in ("still", "unseen"))
+    said |= confidence_of(read_tracks(out / "tracks.json"))
     won = winners(out)
     said |= {f"poses_by_{kind}": float(won[kind]) for kind in ("search", "matches", "registration")}
     row = score(problem, per_visit_answer(scenes, (out / "chronology.safetensors").stat().st_size, said), folder)
@@ -109,6 +108,13 @@ def run(config: SystemConfig, folder: Path, cache: Path) -> dict:
         **stage_seconds(out),
         "seconds_initial": initial_seconds["seconds_cpu"],
     }
+
+
+def confidence_of(tracks: dict) -> dict[str, float]:
+    """The mean confidence of all that happened, as a column; none where nothing happened."""
+    states = [state for each in tracks["objects"] for state in each["states"]]
+    events = [state["confidence"] for state in states if state["event"] not in ("still", "unseen")]
+    return {"confidence": mean(events)} if events else {}
 
 
 def forget_one(stages: Path) -> None:
