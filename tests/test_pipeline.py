@@ -144,6 +144,7 @@ def _fit_steps(run):
     return next(row for row in read_json(run / "stages.json", list) if row["stage"] == "fit")["counts"]["steps"]
 
 
+@pytest.mark.slow  # four runs, two of them with all passes
 def test_a_visit_that_comes_later_costs_what_it_changes_and_ends_as_good_as_all_at_once(tmp_path):
     config = replace(CONFIG, fit=replace(CONFIG.fit, long=_TINY.fit.long))  # enough passes for what is told apart
     capture, aside = write_tiny_capture(tmp_path / "capture", again=True), tmp_path / "t2"

@@ -334,7 +334,13 @@ def _crop(splats: Splats, size: int) -> Crop:
     return Crop(batch, jnp.clip(out.image, 0, 1), backdrop, jnp.full_like(out.alpha, 50.0), valid, out.alpha > 0.5)
 
 
-def test_a_template_is_found_where_it_stands_now():
+@pytest.fixture(scope="module")
+def refiner() -> Refiner:
+    """One for all: what is compiled for templates and windows of one size serves again."""
+    return Refiner()
+
+
+def test_a_template_is_found_where_it_stands_now(refiner):
     rng = np.random.default_rng(5)
     points, colors = _box(rng)
     template = Template(_splats(points, colors, 0.015), 1, 0)
@@ -343,7 +349,7 @@ def test_a_template_is_found_where_it_stands_now():
     truth = SE3(jnp.asarray([np.cos(angle / 2), 0, 0, np.sin(angle / 2)], jnp.float32), jnp.asarray([0.12, 0.07, 0.0]))
     turned = eqx.tree_at(lambda s: s.means, template.splats, truth.apply(template.splats.means))
     crop = _crop(turned, 40)
-    looks = {"size": 0.42, "refiner": Refiner()}
+    looks = {"size": 0.42, "refiner": refiner}
     options = {"rng": rng, "config": TemplateConfig(search_splats=512), **looks}
     search = search_template(template, support, support, np.array([[0.1, 0.1, 0.15]]), crop, **options)
     placement = settle_template(search, crop, **looks)
@@ -370,14 +376,13 @@ def _turned(angle: float, xyz) -> SE3:
     return SE3(jnp.asarray([np.cos(angle / 2), 0, 0, np.sin(angle / 2)], jnp.float32), jnp.asarray(xyz, jnp.float32))
 
 
-def test_polish_ends_where_the_unlikeness_is_least():
+def test_polish_ends_where_the_unlikeness_is_least(refiner):
     points, colors = _box(np.random.default_rng(5))
     splats = _splats(points, colors, 0.015)
     truth = _turned(0.4, [0.1, 0.08, 0])
     crop = _crop(eqx.tree_at(lambda s: s.means, splats, truth.apply(splats.means)), 40)
     begin = _turned(0.44, [0.108, 0.074, 0])
     freedoms = freedoms_of(None) * np.r_[np.full(3, 0.01), np.full(3, 0.04)][:, None]
-    refiner = Refiner()
     before, _ = refiner.score(splats, begin[None], crop, tolerance=0.04)
     found = refiner.polish(splats, begin[None], crop, freedoms, tolerance=0.04, rounds=6)
     assert found.errors[0] < 0.3 * before[0]
@@ -405,7 +410,7 @@ def test_relit_takes_out_shade_and_not_print():
     assert np.abs(relit(wrong, cover, crop) - target)[inside].mean() > 0.8 * np.abs(wrong - target)[inside].mean()
 
 
-def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
+def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade(refiner):
     rng = np.random.default_rng(8)
     around, up = rng.uniform(0, 2 * np.pi, 3000), rng.uniform(0, 0.2, 3000)
     wall = np.stack([0.1 * np.cos(around), 0.1 * np.sin(around), up], axis=-1)
@@ -421,7 +426,7 @@ def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
     now = np.concatenate([np.tile(((1.4 - lit) * bands)[:, None], 3), grey])
     shown = _splats(np.asarray(truth.apply(template.splats.means)), now, 0.008)
     crop = _crop(shown, 56)
-    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
     wrong = _turned(0.0, [0.12, 0.07, 0.0])
     search = Search(template.splats, support, support, wrong[None], np.zeros(1), 1.0, 1.0)
     found = settle_template(search, crop, size=0.4, refiner=refiner)
@@ -430,7 +435,7 @@ def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade():
     assert found.ambiguous_axis is None
 
 
-def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade():
+def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade(refiner):
     rng = np.random.default_rng(11)
     normals = rng.normal(size=(4000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -446,7 +451,7 @@ def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade():
     truth = _turned(np.radians(140), [0.12, 0.07, 0.0])
     outward = np.asarray(truth.apply(jnp.asarray(normals))) - np.asarray(truth.xyz)
     crop = _crop(_splats(np.asarray(truth.apply(template.splats.means)), lit(outward), 0.006), 56)
-    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
     wrong = _turned(np.radians(20), [0.12, 0.07, 0.0])
     search = Search(template.splats, support, support, wrong[None], np.zeros(1), 1.0, 1.0)
     found = settle_template(search, crop, size=0.35, refiner=refiner)
@@ -465,7 +470,7 @@ def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade():
     assert truly.error < 0.8 * as_it_stood.error
 
 
-def test_the_turn_of_a_plain_cylinder_is_not_known_and_its_axis_is_named():
+def test_the_turn_of_a_plain_cylinder_is_not_known_and_its_axis_is_named(refiner):
     rng = np.random.default_rng(8)
     around, up = rng.uniform(0, 2 * np.pi, 2600), rng.uniform(0, 0.2, 2600)
     wall = np.stack([0.1 * np.cos(around), 0.1 * np.sin(around), up], axis=-1)
@@ -478,21 +483,21 @@ def test_the_turn_of_a_plain_cylinder_is_not_known_and_its_axis_is_named():
     where = _turned(0.7, [0.12, 0.07, 0.0])
     now = np.concatenate([0.7 + 0.2 * np.sin(around + 0.7), np.full(800, 0.9)])  # turned, the light where it was
     shown = _splats(np.asarray(where.apply(template.splats.means)), np.tile(now[:, None], 3) * [0.9, 0.5, 0.3], 0.008)
-    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
     search = Search(template.splats, support, support, _turned(0.0, [0.12, 0.07, 0.0])[None], np.zeros(1), 1.0, 1.0)
     found = settle_template(search, _crop(shown, 56), size=0.4, refiner=refiner)
     assert found.gain > 0.7
     np.testing.assert_allclose(found.ambiguous_axis, [0, 0, 1])
 
 
-def test_a_pose_out_of_sight_is_no_better_than_one_in_sight():
+def test_a_pose_out_of_sight_is_no_better_than_one_in_sight(refiner):
     rng = np.random.default_rng(5)
     points, _ = _box(rng)
     wrong = _splats(points, rng.uniform(size=(len(points), 3)), 0.015)  # looks worse than nothing wherever it shows
     crop = _crop(_splats(points, np.full((len(points), 3), 0.5), 0.015), 40)
     wall = jnp.where(jnp.arange(40) < 20, 0.5, 50.0)  # the left half of every window is hidden by something close
     crop = eqx.tree_at(lambda c: c.depth, crop, jnp.broadcast_to(wall, crop.depth.shape))
-    support, refiner = Support(np.array([0.0, 0, 1]), 0.0, 0.004), Refiner()
+    support = Support(np.array([0.0, 0, 1]), 0.0, 0.004)
     poses = pose_hypotheses(points, support, support, np.array([[0.1, 0.1, 0.15]]), turns=2, spread=0.42)
     _, covered = refiner.score(wrong, poses, crop, tolerance=0.04)
     options = {"normal": support.normal, "size": 0.42, "tolerance": 0.04}
