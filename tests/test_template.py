@@ -435,8 +435,9 @@ def test_the_turn_of_a_mug_is_told_by_its_print_and_not_by_its_shade(refiner):
     assert found.ambiguous_axis is None
 
 
-def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade(refiner):
-    rng = np.random.default_rng(11)
+@pytest.mark.parametrize("seed", [11, 3])  # of the print; by its shade the second is first leaned by 43 degrees
+def test_the_turn_of_a_ball_is_told_by_its_print_and_not_by_its_shade(refiner, seed):
+    rng = np.random.default_rng(seed)
     normals = rng.normal(size=(4000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     points = 0.1 * normals + [0.0, 0.0, 0.1]

@@ -228,14 +228,17 @@ def settle_template(search: Search, crop: Crop, *, size: float, refiner: Refiner
     found = refiner.refine(search.template, search.poses, crop, size=size, tolerance=0.1 * size, steps=12, blurred=3)
     best = int(np.argmin(found.errors))
     first, evidence = found.poses[best], search.evidence[best]
-    turned = _other_turns(search, first, crop, size=size, refiner=refiner)
+    points, supports = shown_points(search.template), (search.stood_on, search.stands_on)
+    # The descent follows shade, and leans what is round: its turns are those of it upright.
+    stood = (levelled(pose, points, *supports) for pose in (first, search.poses[best]))
+    stood = next((pose for pose in stood if pose is not None), first)
+    turned = _other_turns(search, stood, crop, size=size, refiner=refiner)
     poses = [nudged(search, pose, crop, size=size, refiner=refiner) for pose in (first, *turned)]
     lit = [place_template(search, pose, crop, size=size, refiner=refiner, lit=True) for pose in poses]
     likeliest = max(range(len(poses)), key=lambda i: (lit[i].worth, -lit[i].error))
     chosen, evidence = poses[likeliest], evidence if likeliest == 0 else SEARCH
     chosen, least = _polished(search, chosen, None, crop, size, refiner, _ROUNDS // 2, width=_FINER)
-    points = shown_points(search.template)
-    upright = levelled(chosen, points, search.stood_on, search.stands_on)
+    upright = levelled(chosen, points, *supports)
     if upright is not None:
         upright, error = _polished(search, upright, search.stood_on.normal, crop, size, refiner, _ROUNDS)
         if error <= least * (1 + _LEVEL_MARGIN):
