@@ -69,13 +69,13 @@ def test_empty_slots_weigh_nothing():
     assert bytes_of(splats) == 3 * 4 * (3 + 4 + 3 + 1 + 3)
 
 
-@pytest.mark.slow
 def test_where_nothing_happens_nothing_is_said_of_confidence():
     states = [{"event": "moved", "confidence": 0.4}, {"event": "still", "confidence": 1.0}]
     assert confidence_of({"objects": [{"states": states}]}) == {"confidence": 0.4}
     assert confidence_of({"objects": [{"states": states[1:]}]}) == {} == confidence_of({"objects": []})
 
 
+@pytest.mark.slow
 def test_noise_moves_only_the_poses_that_methods_use(tmp_path):
     plain = read_capture(open_capture(SMALL.capture, tmp_path))
     noisy = read_capture(open_capture(dataclasses.replace(SMALL.capture, pose_noise=1.0), tmp_path))
