@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
 
 from ltgs_jax.geometry import Camera
-from ltgs_jax.render import RenderPlan, render, splat_votes
+from ltgs_jax.render import RenderPlan, render
 from ltgs_jax.scene import Splats, pad_splats
 
 from .views import StreamedView, View, plan_for, size_of
@@ -172,8 +172,11 @@ def _alpha(splats: Splats, camera: Camera, plan: RenderPlan) -> Float[Array, "h 
 
 @partial(jax.jit, static_argnames=("margin", "plan"))
 def _window_votes(splats: Splats, camera: Camera, flags, margin: int, plan: RenderPlan):
-    shown = render(splats, camera, plan=plan, colors=flags[:, None]).image[..., 0] > _SHOWS
+    # What flags show and what splats paint is one render, and its transpose.
+    colors = jnp.stack([flags, jnp.zeros_like(flags)], axis=-1)
+    image, pull = jax.vjp(lambda colors: render(splats, camera, plan=plan, colors=colors).image, colors)
+    shown = image[..., 0] > _SHOWS
     window = (2 * margin + 1, 2 * margin + 1)
     near = jax.lax.reduce_window(shown, False, jax.lax.bitwise_or, window, (1, 1), "SAME")
     values = jnp.stack([near, jnp.ones_like(near)], axis=-1).astype(splats.means.dtype)
-    return jnp.sum(shown), splat_votes(splats, camera, values, plan=plan)
+    return jnp.sum(shown), pull(values)[0]

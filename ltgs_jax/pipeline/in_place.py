@@ -39,14 +39,15 @@ def turn_in_place(
     config: Config,
     rng: np.random.Generator,
     progress,
-) -> tuple[State, list[Account], list[int]]:
+) -> tuple[State, list[Account], list[int], Evidence]:
     """What seemed to leave, or changed in part, and stands where it stood, turned or nudged: looked for there before
     anything else, since colours that happen to agree leave only pieces of such a change.
 
-    An account of each; and the templates that did not move at all: the photographs of the visit that put them there
-    (`earlier`) like the pose found now as well, which is theirs from that visit on.
+    An account of each; the templates that did not move at all: the photographs of the visit that put them there
+    (`earlier`) like the pose found now as well, which is theirs from that visit on; and the evidence against the scene
+    that it leaves, `evidence` itself where nothing was turned.
     """
-    accounts, stood = [], []
+    accounts, stood, after = [], [], evidence
     matcher = Matcher(state, front_end, config)
     for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
         support, template = state.supports[k], state.chronology.templates[k]
@@ -93,8 +94,10 @@ def turn_in_place(
         if not _elsewhere(pose, before, template, size):
             continue
         trial = set_from(hidden, t, k, visible=True, pose=pose, unsure=config.detect.moved)
-        if _still_changed(trial, t, k, observations, without, front_end, eye=eye, config=config):
+        with_it = compare(eye, scene_at(trial, t), observations, front_end, config)
+        if _still_changed(trial, t, k, observations, without, with_it, eye=eye, config=config):
             continue
+        after = with_it
         since = came_to_place(state, t - 1, k)
         if since > 0 and _stood_so(state, since, k, pose, earlier(since), eye=eye, config=config):
             progress.note(
@@ -106,7 +109,7 @@ def turn_in_place(
         state = set_from(state, t, k, visible=True, pose=pose, unsure=config.detect.moved)
         progress.note(f"visit {t}: object {template.identity} stands where it stood, turned or nudged")
         accounts.append(Account.of_placed(k, "moved", found, views))
-    return state, accounts, stood
+    return state, accounts, stood, after
 
 
 def _stood_so(
@@ -124,12 +127,13 @@ def _turned_candidates(state: State, t: int, gone: dict[int, float], observation
     """Templates that seemed to leave, those on or beside which two photographs or more show that a part changed, and
     those that look a little otherwise than expected all over: what moved before is expected to look worse, and a turn
     that every pixel lets pass is told by all of them."""
-    scene = scene_at(state, t)
+    shown = [k for k in np.flatnonzero(np.asarray(state.chronology.visible)[t]).tolist() if k not in gone]
+    covers = dict(zip(shown, eye.covers(scene_at(state, t), [[k] for k in shown], observations), strict=True))
     for k in range(len(state.chronology.templates)):
         if k in gone:
             yield k
-        elif bool(np.asarray(state.chronology.visible)[t, k]):
-            cover = eye.cover(scene, [k], observations)
+        elif k in covers:
+            cover = covers[k]
             areas = [max(c.sum(), 1) for c in cover]
             near = [dilate(c, max(1, round(_BESIDE * area**0.5))) for c, area in zip(cover, areas, strict=True)]
             changed = [(n & m).sum() for n, m in zip(near, evidence.masks, strict=True)]
@@ -148,15 +152,13 @@ def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool
 
 
 def _still_changed(
-    state: State, t: int, k: int, observations, evidence: Evidence, front_end, *, eye: Eye, config: Config
+    state: State, t: int, k: int, observations, before: Evidence, after: Evidence, *, eye: Eye, config: Config
 ) -> bool:
-    """Whether a template where it is does not make the change go away.
+    """Whether a template where it is does not make the change go away: the evidence without it and with it.
 
     The test is detection's own: what the template shows there, against what its splats are expected to leave.
     """
-    scene = scene_at(state, t)
-    after = compare(eye, scene, observations, front_end, config)
-    cover = eye.cover(scene, [k], observations)
-    was = sum((c & m).sum() for c, m in zip(cover, evidence.masks, strict=True))
+    cover = eye.cover(scene_at(state, t), [k], observations)
+    was = sum((c & m).sum() for c, m in zip(cover, before.masks, strict=True))
     now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
     return bool(now > config.template.tau_remains * max(was, 1))

@@ -18,6 +18,7 @@ from ltgs_jax.template import Refiner, Vantage, unlikeness
 
 from .config import Config
 
+_CHANNELS = 3  # that are painted, or voted for, at once: any number of them is one program
 _BUCKET = 8192  # splats are padded to one multiple of this, so that a cut or an addition compiles nothing anew
 _ROOM = 1.15  # what that leaves for splats to come
 
@@ -112,23 +113,35 @@ class Eye:
         """Any values of the splats, composited as colours are."""
         if values.shape[1] == 1:
             return np.asarray(self._show(splats, camera, values[:, 0]).image)[..., 3:]
-        padded = self._padded(splats)
-        values = np.pad(np.asarray(values, np.float32), ((0, padded.count - splats.count), (0, 0)))
-        return np.asarray(_paint(padded, camera, values, self._plan(padded, camera)))
+        padded, count = self._padded(splats), values.shape[1]
+        plan = self._plan(padded, camera)
+        room = (0, padded.count - splats.count), (0, -count % _CHANNELS)
+        parts = np.split(np.pad(np.asarray(values, np.float32), room), range(_CHANNELS, count, _CHANNELS), axis=1)
+        return np.concatenate([_paint(padded, camera, part, plan) for part in parts], axis=-1)[..., :count]
 
     def cover(
         self, scene: tuple, templates: Sequence[int], observations: Sequence[Observation]
     ) -> list[Bool[np.ndarray, "h w"]]:
         """The pixels of each photograph in which a scene (`scene_at`) shows mostly these templates."""
+        return self.covers(scene, [templates], observations)[0]
+
+    def covers(
+        self, scene: tuple, groups: Sequence[Sequence[int]], observations: Sequence[Observation]
+    ) -> list[list[Bool[np.ndarray, "h w"]]]:
+        """For each group of templates, the pixels of each photograph in which a scene (`scene_at`) shows mostly it."""
         splats, _, owner, _ = scene
-        mine = np.isin(owner, np.asarray(templates, int) + 1)[:, None].astype(np.float32)
-        return [self.paint(splats, o.camera, mine)[..., 0] > 0.5 for o in observations]
+        if not groups:
+            return []
+        theirs = np.stack([np.isin(owner, np.asarray(group, int) + 1) for group in groups], axis=-1)
+        painted = [self.paint(splats, o.camera, theirs) > 0.5 for o in observations]
+        return [[mostly[..., i] for mostly in painted] for i in range(len(groups))]
 
     def votes(self, splats: Splats, camera: Camera, values: Float[np.ndarray, "h w m"]) -> Float[np.ndarray, "n m"]:
         """Σ αT·value per splat."""
-        padded = self._padded(splats)
-        votes = _votes(padded, camera, jnp.asarray(values, jnp.float32), self._plan(padded, camera))
-        return np.asarray(votes)[: splats.count]
+        padded, count = self._padded(splats), values.shape[2]
+        values = np.pad(np.asarray(values, np.float32), ((0, 0), (0, 0), (0, -count % _CHANNELS)))
+        votes = _votes(padded, camera, values, self._plan(padded, camera))
+        return np.asarray(votes)[: splats.count, :count]
 
 
 class Evidence(eqx.Module):

@@ -154,18 +154,9 @@ def object_labels(chronology: Chronology, t: int, camera: Camera, eye: Eye) -> I
         return np.zeros((camera.height, camera.width), np.int32)
     counts = [chronology.background.count, *[m.splats.count for m in chronology.templates]]
     owner = np.repeat([0, *[m.identity for m in chronology.templates]], counts)
-    splats = compose(chronology, t)
-    weights = np.zeros((camera.height, camera.width))
-    labels = np.zeros((camera.height, camera.width), np.int32)
-    for start in range(0, len(identities), 3):
-        chunk = identities[start : start + 3]
-        values = np.stack([owner == i for i in chunk] + [np.zeros_like(owner, bool)] * (3 - len(chunk)), axis=-1)
-        painted = eye.paint(splats, camera, values.astype(np.float32))
-        for j, identity in enumerate(chunk):
-            better = (painted[..., j] > 0.5) & (painted[..., j] > weights)
-            labels[better] = identity
-            weights = np.where(better, painted[..., j], weights)
-    return labels
+    painted = eye.paint(compose(chronology, t), camera, owner[:, None] == np.asarray(identities))
+    mostly = np.asarray(identities, np.int32)[painted.argmax(axis=-1)]
+    return np.where(painted.max(axis=-1) > 0.5, mostly, 0)
 
 
 def pose_change(a: SE3, b: SE3, size: float) -> tuple[float, float]:

@@ -15,7 +15,7 @@ from .state import State, composed, cut_background, cut_template, extend_backgro
 
 _PRICE = 6e-3  # growth of the squared error over all later photographs for which the splats that show least may go
 _FEW = 8  # splats that a template must keep
-_HALVINGS = 4  # of the number of splats in question
+_HALVINGS = 5  # of the number of splats in question
 
 
 def late_splats(state: State, first: Splats) -> Bool[np.ndarray, " n"]:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
 from ltgs_jax.detect import dilate, similarity
 from ltgs_jax.features import FrontEnd
@@ -79,19 +79,21 @@ def explain_visit(
     remnants: list[Remnant] = []
     # Twice: with the bulk of an object gone, what the first cut left of it stands out.
     for _ in range(2):
-        background = state.chronology.background
+        before = state
         state, gone, torn = take_out(state, t, gone, scene, observations, evidence, eye=eye, config=config, rng=rng)
         remnants += torn
+        if state is before:
+            break
         scene = scene_at(state, t)
         evidence = compare(eye, scene, observations, front_end, config)
-        if state.chronology.background is background:
+        if state.chronology.background is before.chronology.background:
             break
     tools = {"eye": eye, "config": config, "rng": rng, "progress": progress}
-    state, turned, stood = turn_in_place(state, t, gone, observations, evidence, front_end, earlier=earlier, **tools)
+    state, turned, stood, evidence = turn_in_place(
+        state, t, gone, observations, evidence, front_end, earlier=earlier, **tools
+    )
     gone = {k: share for k, share in gone.items() if k not in stood}
-    if turned or stood:
-        scene = scene_at(state, t)
-        evidence = compare(eye, scene, observations, front_end, config)
+    scene = scene_at(state, t)
     silhouettes = [
         dilate(mask, config.detect.dilate) & o.valid for mask, o in zip(evidence.masks, observations, strict=True)
     ]
@@ -115,11 +117,11 @@ def explain_visit(
     )
     accounts += turned
     unsettled = sorted(set(gone) - {a.template for a in turned})
-    state, accounts = _put_back(
+    state, accounts, images = _put_back(
         state, t, unsettled, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
     state, accounts = join_states(state, t, accounts)
-    state = _learn_errors(state, t, accounts, observations, front_end, eye, config)
+    state = _learn_errors(state, t, accounts, images, observations, front_end, eye, config)
     return Explained(state, accounts, coarse, unlike)
 
 
@@ -134,10 +136,11 @@ def _strength(instance: Instance, evidence: Evidence) -> float:
 def _put_back(
     state: State, t: int, gone: Sequence[int], remnants: Sequence[Remnant], accounts: list[Account], known: int,
     observations, *, eye, config, progress,
-) -> tuple[State, list[Account]]:  # fmt: skip
+) -> tuple[State, list[Account], list[Float[np.ndarray, "h w 3"]]]:  # fmt: skip
     """What left stays after all where the photographs like the scene with it as well: still is cheaper than moved.
 
-    Something cut out of the background at this visit (`known` and later) goes back into it.
+    Something cut out of the background at this visit (`known` and later) goes back into it. Also the scene as it then
+    is in each photograph.
     """
     final = {a.template: a for a in accounts}
     images = [eye.image(scene_at(state, t)[0], o.camera) for o in observations]
@@ -183,20 +186,22 @@ def _put_back(
             a.template: a
             for a in (dataclasses.replace(a, template=a.template - (a.template > k)) for a in final.values())
         }
-    return state, [final[k] for k in sorted(final)]
+    return state, [final[k] for k in sorted(final)], images
 
 
 def _learn_errors(
-    state: State, t: int, accounts: Sequence[Account], observations, front_end: FrontEnd, eye: Eye, config: Config
-) -> State:
-    """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them."""
+    state: State, t: int, accounts: Sequence[Account], images: Sequence[Float[np.ndarray, "h w 3"]], observations,
+    front_end: FrontEnd, eye: Eye, config: Config,
+) -> State:  # fmt: skip
+    """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them;
+    `images`: the scene in each."""
     placed = [a for a in accounts if a.kind in ("moved", "added", "new_state")]
     if not placed:
         return state
     splats, _, owner, _ = scene_at(state, t)
     votes = np.zeros((splats.count, 2))
-    for o in observations:
-        unlike = 1 - similarity(eye.image(splats, o.camera), o.image, front_end, gamma=config.detect.gamma)
+    for image, o in zip(images, observations, strict=True):
+        unlike = 1 - similarity(image, o.image, front_end, gamma=config.detect.gamma)
         votes += eye.votes(splats, o.camera, np.stack([unlike * o.valid, o.valid], axis=-1))
     for account in placed:
         mine = votes[owner == account.template + 1]
