@@ -19,6 +19,7 @@ from ltgs_jax.pipeline.config import Config
 from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
+from ltgs_jax.pipeline.ledger import small_views
 from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host
 from ltgs_jax.pipeline.outputs import _name_of, _track
 from ltgs_jax.pipeline.prune import drop_idle, late_splats, merge_ground, without
@@ -32,6 +33,7 @@ from ltgs_jax.pipeline.state import (
     extend_background,
     extend_template,
     hand_over,
+    scene_at,
     set_from,
     split_template,
 )
@@ -156,11 +158,41 @@ def test_what_looks_a_little_otherwise_all_over_is_looked_at_turned(state):
         nothing = np.zeros((48, 64), bool)
         changes = [ChangeMap(np.full((48, 64), s, np.float32), np.zeros((48, 64)), nothing, False) for s in scores]
         seen = observations[: len(scores)]
-        return list(_turned_candidates(state, 2, {}, seen, Evidence((), tuple(changes)), eye=eye))
+        evidence = Evidence((), tuple(changes))
+        return [k for k, _ in _turned_candidates(state, 2, {}, seen, evidence, eye=eye)]
 
     assert candidates(1.8, 0.9) == [0]
     assert candidates(0.9, 0.4) == []
     assert candidates(3.0) == []  # one photograph may be wrong all over
+
+
+def test_what_several_groups_cover_is_told_at_once_as_each_by_itself(state):
+    book, mug = np.arange(180) < 100, np.arange(180) >= 100
+    state = split_template(state, 0, mug, _FLOOR)
+    eye, K = Eye(), jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    down = SE3(jnp.asarray([0.0, 1, 0, 0]), jnp.asarray([-0.3, 0.0, 2.5]))
+    photograph = Observation("c/0.png", Camera(down, K, 64, 48), np.zeros((48, 64, 3)), np.ones((48, 64), bool))
+    groups, scene = [[0], [1], [], [0, 1], [1]], scene_at(state, 2)
+    together = [masks[0] for masks in eye.covers(scene, groups, [photograph])]
+    alone = [eye.cover(scene, group, [photograph])[0] for group in groups]
+    assert book.sum() == state.chronology.templates[0].splats.count
+    assert together[0].sum() > together[1].sum() > 0 and not together[2].any()
+    for a, b in zip(together, alone, strict=True):
+        np.testing.assert_array_equal(a, b)
+    assert eye.covers(scene, [], [photograph]) == []
+
+
+@pytest.mark.parametrize(
+    ("size", "small"), [((1280, 960), (320, 240)), ((639, 480), (639, 480)), ((480, 641), (240, 320))]
+)
+def test_what_something_buys_is_told_on_photographs_halved_while_they_keep_enough(size, small):
+    width, height = size
+    K = jnp.asarray([[60.0, 0, width / 2], [0, 60, height / 2], [0, 0, 1]])
+    image = np.full((height, width, 3), 90, np.uint8)
+    (view,) = small_views([VisitView(View(Camera(SE3.identity(), K, *size), image, np.ones((height, width), bool)), 3)])
+    assert (view.view.camera.width, view.view.camera.height) == small
+    assert view.view.image.shape == (*small[::-1], 3) and (view.view.image == 90).all()
+    assert view.visit == 3
 
 
 def test_an_account_keeps_the_axis_through_json():

@@ -1,11 +1,12 @@
 """Where a photograph differs from the render by more than the scene's own error lets expect."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
@@ -90,9 +91,11 @@ def change_map(
     if unlike.sum() > _WIDE * known.sum() and (unlike & detailed).sum() > _EVERYWHERE * detailed.sum():
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False, everywhere=True)
     scores, masks, thresholds = [], [], []
-    colours = _standardize(_colour_difference(rendered, captured), expected, known, floor=0.005) > config.sigmas
+    alike = _equally_expected(expected[known])
+    colours = _colour_difference(rendered, captured)
+    colours = _standardize(colours, expected, known, alike, floor=0.005) > config.sigmas
     for weight in (np.clip(0.5 + balance, 0, 1.25), np.clip(1 - balance, 0, 1)):
-        score = _standardize(excess * weight, expected, known, floor=0.01)
+        score = _standardize(excess * weight, expected, known, alike, floor=0.01)
         clipped = np.clip(score[known], 0, 4 * config.sigmas)
         threshold = max(float(threshold_otsu(clipped)), config.sigmas) if np.ptp(clipped) > 0 else config.sigmas
         coarse = clean(known & (score > threshold), config.min_area)
@@ -123,19 +126,28 @@ def _detail_balance(
     return (a - b) / (a + b + _LEAST_GRADIENT**2), a + b > _LEAST_GRADIENT**2
 
 
+def _equally_expected(expected: Float[np.ndarray, " n"]) -> list[Int[np.ndarray, " m"]]:
+    """Pixels in bins of about equal expectation."""
+    order = np.argsort(expected, kind="stable")
+    return np.array_split(order, int(np.clip(len(order) // 400, 1, 12)))
+
+
 def _standardize(
-    value: Float[np.ndarray, "h w"], expected: Float[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], *, floor: float
+    value: Float[np.ndarray, "h w"],
+    expected: Float[np.ndarray, "h w"],
+    known: Bool[np.ndarray, "h w"],
+    bins: Sequence[Int[np.ndarray, " m"]],
+    *,
+    floor: float,
 ) -> Float[np.ndarray, "h w"]:
     """`value` in robust deviations above its usual level, 0 where not `known`.
 
     Level and deviation grow in proportion to `expected`: what the scene explains badly differs more, and differs more
-    widely. The two factors are medians over bins of equal expectation, so that neither a large change nor a large
+    widely. The two factors are medians over `bins` of equal expectation, so that neither a large change nor a large
     blurred background decides them alone.
     """
     scale = expected + _LEAST_EXPECTED
     ratio = (value / scale)[known]
-    order = np.argsort(expected[known], kind="stable")
-    bins = np.array_split(order, int(np.clip(len(order) // 400, 1, 12)))
     level = np.median([np.median(ratio[b]) for b in bins])
     spread = np.median([1.4826 * np.median(np.abs(ratio[b] - level)) for b in bins])
     return np.where(known, (value - level * scale) / (spread * scale + floor), 0).astype(np.float32)

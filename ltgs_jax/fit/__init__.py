@@ -14,3 +14,4 @@ from .loss import photometric_loss as photometric_loss
 from .views import Budget as Budget
 from .views import StreamedView as StreamedView
 from .views import View as View
+from .views import halved as halved

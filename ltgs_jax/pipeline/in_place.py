@@ -49,7 +49,8 @@ def turn_in_place(
     """
     accounts, stood, after = [], [], evidence
     matcher = Matcher(state, front_end, config)
-    for k in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
+    first = state
+    for k, cover in _turned_candidates(state, t, gone, observations, evidence, eye=eye):
         support, template = state.supports[k], state.chronology.templates[k]
         if support is None:
             continue
@@ -59,8 +60,9 @@ def turn_in_place(
         if k not in gone:
             hidden = set_from(state, t, k, visible=False)
             without = compare(eye, scene_at(hidden, t), observations, front_end, config)
-        shown = scene_at(set_from(hidden, t, k, visible=True, pose=before), t)
-        cover = eye.cover(shown, [k], observations)
+        if cover is None or state is not first:
+            shown = scene_at(set_from(hidden, t, k, visible=True, pose=before), t)
+            cover = eye.cover(shown, [k], observations)
         regions = [dilate(c, 4) & m for c, m in zip(cover, without.masks, strict=True)]
         views = sum(bool((c & m).sum() > 0.5 * c.sum() > 0) for c, m in zip(cover, without.masks, strict=True))
         if views == 0:
@@ -124,14 +126,14 @@ def _stood_so(
 
 
 def _turned_candidates(state: State, t: int, gone: dict[int, float], observations, evidence: Evidence, *, eye: Eye):
-    """Templates that seemed to leave, those on or beside which two photographs or more show that a part changed, and
-    those that look a little otherwise than expected all over: what moved before is expected to look worse, and a turn
-    that every pixel lets pass is told by all of them."""
+    """Templates, each with the pixels that it covers where it shows: those that seemed to leave, those on or beside
+    which two photographs or more show that a part changed, and those that look a little otherwise than expected all
+    over: what moved before is expected to look worse, and a turn that every pixel lets pass is told by all of them."""
     shown = [k for k in np.flatnonzero(np.asarray(state.chronology.visible)[t]).tolist() if k not in gone]
     covers = dict(zip(shown, eye.covers(scene_at(state, t), [[k] for k in shown], observations), strict=True))
     for k in range(len(state.chronology.templates)):
         if k in gone:
-            yield k
+            yield k, None
         elif k in covers:
             cover = covers[k]
             areas = [max(c.sum(), 1) for c in cover]
@@ -140,7 +142,7 @@ def _turned_candidates(state: State, t: int, gone: dict[int, float], observation
             partly = sum(c > _PARTLY * area for c, area in zip(changed, areas, strict=True)) >= 2
             scores = [change.score[c].mean() for change, c in zip(evidence.changes, cover, strict=True) if c.any()]
             if partly or (len(scores) >= 2 and np.mean(scores) > _OFF):
-                yield k
+                yield k, cover
 
 
 def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool:

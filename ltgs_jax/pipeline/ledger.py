@@ -6,12 +6,13 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ltgs_jax.fit import VisitView
+from ltgs_jax.fit import VisitView, halved
 from ltgs_jax.scene import Chronology, Splats, drop_hidden
 
 from .looks import Eye
 from .state import Account, composed
 
+_ENOUGH = 320  # pixels along the longer side of a photograph that tell what something buys
 _POSE, _SHADE, _BLOB = 7, 4, 5  # numbers for a pose, an object's shade at it, and a shadow's blob
 
 
@@ -27,12 +28,12 @@ def make_ledger(
     "gain_db", "evidence"}.
 
     Parameters are those that came with that visit, 4 bytes each. The gain is the PSNR over all of the visit's
-    photographs, whole, less that of the same scene without the one thing: an object where and as it was at the visit
-    before, ground or light left out. They are the photographs that the fit saw: a gain of nothing says that the
-    addition was not worth its bytes, a high one not that it is right. The evidence is what proposed the pose of a known
-    object, None elsewhere.
+    photographs, whole and small (`small_views`), less that of the same scene without the one thing: an object where and
+    as it was at the visit before, ground or light left out. They are the photographs that the fit saw: a gain of
+    nothing says that the addition was not worth its bytes, a high one not that it is right. The evidence is what
+    proposed the pose of a known object, None elsewhere.
     """
-    rows = []
+    rows, views = [], small_views(views)
     names = chronology.visits
     for t in range(1, len(names)):
         seen = [v for v in views if v.visit == t]
@@ -109,6 +110,17 @@ def _numbers(splats: Splats) -> int:
     shining, more = int(rest.any(axis=(1, 2)).sum()), int(np.prod(rest.shape[1:]))
     each = sum(int(np.prod(leaf.shape[1:])) for leaf in jax.tree.leaves(splats))
     return splats.count * (each - more) + shining * more
+
+
+def small_views(views: Sequence[VisitView]) -> list[VisitView]:
+    """Views as small as still tells what something buys: halved while their longer side keeps `_ENOUGH` pixels."""
+    small = []
+    for v in views:
+        view = v.view
+        while max(view.camera.width, view.camera.height) >= 2 * _ENOUGH:
+            (view,) = halved([view])
+        small.append(VisitView(view, v.visit))
+    return small
 
 
 def squared_error(scene: Splats, views: Sequence[VisitView], eye: Eye) -> float:

@@ -9,13 +9,16 @@ from ltgs_jax.fit import VisitView
 from ltgs_jax.scene import Splats, Template
 from ltgs_jax.template import coarser
 
-from .ledger import squared_error
+from .ledger import small_views, squared_error
 from .looks import Eye, on_host
 from .state import State, composed, cut_background, cut_template, extend_background
 
 _PRICE = 6e-3  # growth of the squared error over all later photographs for which the splats that show least may go
 _FEW = 8  # splats that a template must keep
-_HALVINGS = 5  # of the number of splats in question
+_TRIALS = 4  # at how many of them may go
+_FIRST = 0.05  # share of what they paint that the first trial leaves out
+_AIM = 0.95  # of the price, at the trials after it
+_PACE = 4.0  # times as much, at most, from one trial to the next
 
 
 def late_splats(state: State, first: Splats) -> Bool[np.ndarray, " n"]:
@@ -36,8 +39,8 @@ def drop_idle(
     state: State, late: Bool[np.ndarray, " n"], views: Sequence[VisitView], eye: Eye
 ) -> tuple[State, Bool[np.ndarray, " n"]]:
     """The state without as many as possible of its `late_splats`, those that show least first, at no more than a price
-    in squared error over photographs of later visits; and which went, as a mask over the background's splats and then
-    each template's.
+    in squared error over photographs of later visits (`small_views`); and which went, as a mask over the background's
+    splats and then each template's.
 
     What came with the first visit stays as it is.
     """
@@ -45,6 +48,7 @@ def drop_idle(
         return state, late
     counts = [state.chronology.background.count, *(m.splats.count for m in state.chronology.templates)]
     owner = np.repeat(np.arange(len(counts)), counts)
+    views = small_views(views)
     visits = {v.visit: [w for w in views if w.visit == v.visit] for v in views}
     scenes = {t: composed(state.chronology, t) for t in visits}
     showing = {t: np.asarray(scene.logit_opacities) > -np.inf for t, scene in scenes.items()}
@@ -65,11 +69,16 @@ def drop_idle(
         each = [squared_error(scenes[t][showing[t] & ~gone], seen, eye) for t, seen in visits.items()]
         return float(np.mean(each))
 
-    most, low, high = (1 + _PRICE) * error(idle(0)), 0, len(order) + 1
-    # The error grows with the number of those left out: halving finds the most.
-    for _ in range(_HALVINGS):
-        count = (low + high) // 2
-        low, high = (count, high) if error(idle(count)) <= most else (low, count)
+    whole, low, high, target = max(error(idle(0)), 1e-12), 0, len(order) + 1, _FIRST
+    painted = np.cumsum(shown[order]) / max(shown[order].sum(), 1e-12)
+    for _ in range(_TRIALS):
+        if high - low == 1:
+            break
+        count = int(np.clip(np.searchsorted(painted, target), low + 1, high - 1))
+        growth = error(idle(count)) / whole - 1
+        low, high = (count, high) if growth <= _PRICE else (low, count)
+        # The error grows about as the square of what those left out had painted.
+        target = max(painted[count - 1], 1e-6) * min((_AIM * _PRICE / max(growth, 1e-12)) ** 0.5, _PACE)
     gone = idle(low)
     return without(state, gone), gone
 
