@@ -1,13 +1,13 @@
 """The names that `import ltgs_jax` hands on, and the README's example."""
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_capture import write_tiny_capture
 
 import ltgs_jax as ltgs
 from ltgs_jax.io import read_pixels, read_ply
@@ -22,10 +22,12 @@ def _readme_example() -> str:
     return re.search(r"```python\n(.*?)```", text, re.DOTALL).group(1)
 
 
-def test_readme_example_runs(tmp_path, monkeypatch, capsys):
+def test_readme_example_runs(tiny_run, tmp_path, monkeypatch, capsys):
+    """On the folder of a run that ended, which the example takes up again."""
     example = _readme_example()
     assert len(example.splitlines()) <= 15
-    write_tiny_capture(tmp_path / "CAPTURE")
+    for made, name in zip(tiny_run, ("CAPTURE", "DIR"), strict=True):
+        shutil.copytree(made, tmp_path / name)
     monkeypatch.chdir(tmp_path)
     names: dict = {}
     exec(compile(example, "README.md", "exec"), names)

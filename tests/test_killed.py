@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 import safetensors.numpy
-from tiny_capture import write_tiny_capture
 
 from ltgs_jax import pipeline
 from ltgs_jax.cli import main
@@ -57,18 +56,9 @@ def _update(capture: Path, out: Path) -> _Quiet:
     return progress
 
 
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory) -> tuple[Path, Path]:
-    """A tiny capture and its uninterrupted run."""
-    folder = tmp_path_factory.mktemp("killed")
-    capture = write_tiny_capture(folder / "capture")
-    _update(capture, folder / "whole")
-    return capture, folder / "whole"
-
-
-def test_stopped_at_any_write_it_goes_on_to_the_same_result(tiny, tmp_path, monkeypatch):
+def test_stopped_at_any_write_it_goes_on_to_the_same_result(tiny_run, tmp_path, monkeypatch):
     """Each time at a later write, before or after the file is renamed into place, then once to the end."""
-    capture, whole = tiny
+    capture, whole = tiny_run
     out = tmp_path / "out"
     rng = random.Random(4)
     replace = os.replace
@@ -91,8 +81,8 @@ def test_stopped_at_any_write_it_goes_on_to_the_same_result(tiny, tmp_path, monk
     assert _results(out) == _results(whole)
 
 
-def test_a_full_disk_ends_in_one_line_and_costs_no_finished_stage(tiny, tmp_path, monkeypatch, capsys):
-    capture, whole = tiny
+def test_a_full_disk_ends_in_one_line_and_costs_no_finished_stage(tiny_run, tmp_path, monkeypatch, capsys):
+    capture, whole = tiny_run
     out = tmp_path / "out"
     sync, left = os.fsync, [6]
 
@@ -114,16 +104,16 @@ def test_a_full_disk_ends_in_one_line_and_costs_no_finished_stage(tiny, tmp_path
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root writes to read-only folders")
-def test_a_read_only_folder_is_named(tiny, tmp_path, capsys):
+def test_a_read_only_folder_is_named(tiny_run, tmp_path, capsys):
     (tmp_path / "locked").mkdir(mode=0o500)
-    assert main(["update", str(tiny[0]), "--out", str(tmp_path / "locked" / "out"), "--preset", "tiny"]) == 2
+    assert main(["update", str(tiny_run[0]), "--out", str(tmp_path / "locked" / "out"), "--preset", "tiny"]) == 2
     assert "locked" in capsys.readouterr().err
 
 
-def test_a_file_where_the_folder_should_be_is_named(tiny, tmp_path, capsys):
+def test_a_file_where_the_folder_should_be_is_named(tiny_run, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "out"):
-        assert main(["update", str(tiny[0]), "--out", str(out), "--preset", "tiny"]) == 2
+        assert main(["update", str(tiny_run[0]), "--out", str(out), "--preset", "tiny"]) == 2
         error = capsys.readouterr().err.splitlines()[-1]
         assert str(out) in error and error.startswith("ltgs: ")
 

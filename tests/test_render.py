@@ -10,6 +10,7 @@ from render_scenes import make_camera, make_splats
 from ltgs_jax.geometry import SE3, Camera, stack_cameras
 from ltgs_jax.render import RenderConfig, RenderPlan, plan_render, render, render_reference, splat_votes
 
+_SLOW = pytest.mark.slow  # what other cases of the default suite reach as well
 FIELDS = ("image", "alpha", "depth")
 
 
@@ -33,7 +34,10 @@ def _moved(camera: Camera, tangent) -> Camera:
     return Camera(camera.cam_from_world @ SE3.exp(tangent), camera.K, camera.width, camera.height)
 
 
-@pytest.mark.parametrize(("width", "height"), [(45, 37), (1, 1), (8, 8), (9, 17), (64, 3)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [(45, 37), (1, 1), (64, 3), pytest.param(8, 8, marks=_SLOW), pytest.param(9, 17, marks=_SLOW)],
+)
 def test_image_equals_reference(width, height):
     splats, camera = make_splats(), make_camera(width, height)
     background = jnp.asarray([0.2, 0.5, 0.9])
@@ -53,7 +57,7 @@ def test_image_does_not_depend_on_config(config):
     )
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, pytest.param(1, marks=_SLOW), pytest.param(2, marks=_SLOW), 3])
 def test_gradients_equal_reference(degree):
     splats, camera = make_splats(40, degree=degree), make_camera()
     plan = plan_render(splats, camera)
