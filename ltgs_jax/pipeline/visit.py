@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
 from ltgs_jax.detect import dilate, similarity
 from ltgs_jax.features import FrontEnd
@@ -117,11 +117,11 @@ def explain_visit(
     )
     accounts += turned
     unsettled = sorted(set(gone) - {a.template for a in turned})
-    state, accounts, images = _put_back(
+    state, accounts = _put_back(
         state, t, unsettled, remnants, accounts, known, observations, eye=eye, config=config, progress=progress
     )
     state, accounts = join_states(state, t, accounts)
-    state = _learn_errors(state, t, accounts, images, observations, front_end, eye, config)
+    state = _learn_errors(state, t, accounts, observations, front_end, eye, config)
     return Explained(state, accounts, coarse, unlike)
 
 
@@ -136,11 +136,10 @@ def _strength(instance: Instance, evidence: Evidence) -> float:
 def _put_back(
     state: State, t: int, gone: Sequence[int], remnants: Sequence[Remnant], accounts: list[Account], known: int,
     observations, *, eye, config, progress,
-) -> tuple[State, list[Account], list[Float[np.ndarray, "h w 3"]]]:  # fmt: skip
+) -> tuple[State, list[Account]]:  # fmt: skip
     """What left stays after all where the photographs like the scene with it as well: still is cheaper than moved.
 
-    Something cut out of the background at this visit (`known` and later) goes back into it. Also the scene as it then
-    is in each photograph.
+    Something cut out of the background at this visit (`known` and later) goes back into it.
     """
     final = {a.template: a for a in accounts}
     images = [eye.image(scene_at(state, t)[0], o.camera) for o in observations]
@@ -186,22 +185,20 @@ def _put_back(
             a.template: a
             for a in (dataclasses.replace(a, template=a.template - (a.template > k)) for a in final.values())
         }
-    return state, [final[k] for k in sorted(final)], images
+    return state, [final[k] for k in sorted(final)]
 
 
 def _learn_errors(
-    state: State, t: int, accounts: Sequence[Account], images: Sequence[Float[np.ndarray, "h w 3"]], observations,
-    front_end: FrontEnd, eye: Eye, config: Config,
-) -> State:  # fmt: skip
-    """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them;
-    `images`: the scene in each."""
+    state: State, t: int, accounts: Sequence[Account], observations, front_end: FrontEnd, eye: Eye, config: Config
+) -> State:
+    """What the templates that moved or came leave unexplained in this visit's photographs is to be expected of them."""
     placed = [a for a in accounts if a.kind in ("moved", "added", "new_state")]
     if not placed:
         return state
     splats, _, owner, _ = scene_at(state, t)
     votes = np.zeros((splats.count, 2))
-    for image, o in zip(images, observations, strict=True):
-        unlike = 1 - similarity(image, o.image, front_end, gamma=config.detect.gamma)
+    for o in observations:
+        unlike = 1 - similarity(eye.image(splats, o.camera), o.image, front_end, gamma=config.detect.gamma)
         votes += eye.votes(splats, o.camera, np.stack([unlike * o.valid, o.valid], axis=-1))
     for account in placed:
         mine = votes[owner == account.template + 1]
