@@ -92,7 +92,7 @@ def change_map(
         return ChangeMap(nothing, nothing, np.zeros_like(valid), False, everywhere=True)
     scores, masks, thresholds = [], [], []
     alike = _equally_expected(expected[known])
-    colours = _colour_difference(rendered, captured)
+    colours = colour_difference(rendered, captured)
     colours = _standardize(colours, expected, known, alike, floor=0.005) > config.sigmas
     for weight in (np.clip(0.5 + balance, 0, 1.25), np.clip(1 - balance, 0, 1)):
         score = _standardize(excess * weight, expected, known, alike, floor=0.01)
@@ -153,7 +153,7 @@ def _standardize(
     return np.where(known, (value - level * scale) / (spread * scale + floor), 0).astype(np.float32)
 
 
-def _colour_difference(
+def colour_difference(
     rendered: Float[np.ndarray, "h w 3"], captured: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w"]:
     """Mean absolute difference of the colours, the smallest over shifts of the render by up to a pixel."""

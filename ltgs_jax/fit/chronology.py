@@ -28,14 +28,12 @@ from ltgs_jax.scene import (
 from .devices import mean_gradient, mesh_for, stacked
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
-from .schedule import Draws, Watch
+from .schedule import Draws, Watch, held_out
 from .shadows import lay_blobs
-from .views import StreamedView, View, plan_for, scene_extent, size_of
+from .views import VisitView, plan_for, scene_extent, size_of
 from .windows import Shown, Window, window_side, windows_of, within_change
 
 _PRICE = 1e-3  # of a shadow's gain, as the slope of the loss
-_TILE = 8  # side in pixels of the squares that are held out
-_HELD_OUT = 1 / 16  # of the squares of every window of a later visit
 
 
 @dataclass(frozen=True)
@@ -67,13 +65,6 @@ class LongConfig:
     casts there; 0: it looks everywhere as where it was first seen."""
     fit_poses: bool = True
     rates: Rates = field(default_factory=lambda: Rates(means=2e-4, means_final=2e-5, logit_opacities=2e-2))
-
-
-class VisitView(eqx.Module):
-    """A photograph and the visit whose scene it shows."""
-
-    view: View | StreamedView
-    visit: int
 
 
 class Placements(eqx.Module):
@@ -438,12 +429,6 @@ def _fit_windows(
     return variables, losses
 
 
-def _held_out(side: int, rng: np.random.Generator) -> Bool[np.ndarray, "s s"]:
-    """Squares of a window that nothing is fitted to."""
-    tiles = rng.random((-(-side // _TILE),) * 2) < _HELD_OUT
-    return tiles.repeat(_TILE, axis=0).repeat(_TILE, axis=1)[:side, :side]
-
-
 def _looks(windows: Sequence[Window], rows, fixed: _Fixed, since: int, rng: np.random.Generator) -> list[_Look]:
     """Each window by itself, on the host, all of one shape and its visit traced, so that one program serves all; of
     those of later visits, squares are held out."""
@@ -453,7 +438,7 @@ def _looks(windows: Sequence[Window], rows, fixed: _Fixed, since: int, rng: np.r
     for window, pair in zip(windows, rows, strict=True):
         own, ground = (_padded(r, length, count) for r, length, count in zip(pair, lengths, counts, strict=True))
         window = eqx.tree_at(lambda w: (w.visit, w.rows), window, (np.asarray(window.visit), None))
-        held = _held_out(len(window.mask), rng) & (window.visit >= since)
+        held = held_out(window.mask.shape, rng) & (window.visit >= since)
         looks.append(_Look(jax.tree.map(np.asarray, window), held, own, ground, np.arange(len(own), dtype=np.int32)))
     return looks
 

@@ -4,12 +4,20 @@ from collections.abc import Sequence
 
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Bool, PyTree
 
 from .windows import Window
 
+_TILE = 8  # side in pixels of the squares that are held out
+_HELD_OUT = 1 / 16  # of the squares of every picture
 _FIRST = 0.5  # share of the first visit in what is replayed, where later ones were fitted before
 _PATIENCE = 0.3  # share of the passes that may, one after the other, come out no better than the best before
+
+
+def held_out(shape: tuple[int, int], rng: np.random.Generator) -> Bool[np.ndarray, "h w"]:
+    """Squares of a picture that nothing is fitted to."""
+    tiles = rng.random([-(-side // _TILE) for side in shape]) < _HELD_OUT
+    return tiles.repeat(_TILE, axis=0).repeat(_TILE, axis=1)[: shape[0], : shape[1]]
 
 
 class Draws:

@@ -68,6 +68,13 @@ class StreamedView:
         return view
 
 
+class VisitView(eqx.Module):
+    """A photograph and the visit whose scene it shows."""
+
+    view: View | StreamedView
+    visit: int
+
+
 def halved(views: Sequence[View | StreamedView]) -> list[View | StreamedView]:
     """All views at half resolution; streamed ones stay streamed, with a quarter of their budget."""
     budgets: dict[Budget, Budget] = {}

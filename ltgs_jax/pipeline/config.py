@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from ltgs_jax.detect import DetectConfig
-from ltgs_jax.fit import InitialConfig, LongConfig
+from ltgs_jax.fit import InitialConfig, LongConfig, MendConfig
 from ltgs_jax.io import InputError
 from ltgs_jax.localize import LocalizeConfig
 from ltgs_jax.match import MatchConfig
@@ -26,10 +26,11 @@ class IoConfig:
 
 @dataclass(frozen=True)
 class FitConfig:
-    """The two optimisations."""
+    """The optimisations."""
 
     initial: InitialConfig = field(default_factory=InitialConfig)
     long: LongConfig = field(default_factory=LongConfig)
+    mend: MendConfig = field(default_factory=MendConfig)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,16 @@ import numpy as np
 
 from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
-from ltgs_jax.fit import Budget, StreamedView, View, VisitView, fit_chronology, fit_initial, splats_from_points
+from ltgs_jax.fit import (
+    Budget,
+    StreamedView,
+    View,
+    VisitView,
+    fit_chronology,
+    fit_initial,
+    mend_background,
+    splats_from_points,
+)
 from ltgs_jax.io import (
     Capture,
     InputError,
@@ -45,6 +54,7 @@ from .programs import free_programs
 from .prune import drop_idle, late_splats, merge_ground
 from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
+from .unknown import barely_shown, without_unexplained
 from .visit import explain_visit
 
 _UNLIKE = "it differs from the scene all over: another place, another pose, or a room in which nothing stayed"
@@ -121,6 +131,8 @@ def update(
         key, state = fits[-1], states[-1]
         later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
         chronology = _long_fit(store, fits, run, states, later, eye, progress)
+        key = digest(key, "mend", config.fit.mend)
+        chronology = _mend(store, key, run, chronology, later, eye, progress)
         _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
@@ -302,6 +314,45 @@ def _long_fit(
 
     arrays, notes = store.run("fit", keys[-1], compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology
+
+
+def _mend(store: Store, key: str, run: Run, chronology: Chronology, later, eye: Eye, progress) -> Chronology:
+    """The chronology with its background fitted on, where photographs of later visits show much that those of the first
+    hardly did; skipped, and said so, where they do not."""
+    config = run.config.fit.mend
+
+    def compute():
+        background = chronology.background
+        if not chronology.templates:
+            return arrays_of("background", background), {"mended": False, "counts": {"steps": 0}}
+        first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
+        barely, share = barely_shown(chronology, first, later(), eye)
+        if share < config.share or config.passes == 0:
+            progress.note(f"{100 * share:.0f} % of what later photographs show was hardly shown before: not mended")
+            counts = {"unknown": round(share, 4), "steps": 0}
+            return arrays_of("background", background), {"mended": False, "counts": counts}
+        progress.note(f"{100 * share:.0f} % of what later photographs show was hardly shown before: mending it")
+        found = mend_background(
+            chronology,
+            first + without_unexplained(chronology, barely, later(), eye, sigmas=run.config.detect.sigmas),
+            key=jax.random.key(run.seed),
+            config=config,
+            progress=progress.step,
+        )
+        (was, now), (first_was, first_now) = found.unseen, found.first
+        progress.note(
+            f"held-out squares: mean error {was:.4f}, mended {now:.4f}; first visit {first_was:.4f}, {first_now:.4f}"
+            + ("" if found.kept else ": not kept")
+        )
+        errors = {"held_out": found.unseen, "first_visit": found.first}
+        counts = {"unknown": round(share, 4), "steps": len(found.losses), "kept": int(found.kept)}
+        mended = jax.tree.map(np.asarray, found.chronology.background)
+        return arrays_of("background", mended), {"mended": found.kept, "errors": errors, "counts": counts}
+
+    arrays, notes = store.run("mend", key, compute)
+    if not notes["mended"]:
+        return chronology
+    return eqx.tree_at(lambda c: c.background, chronology, module_of(Splats, "background", arrays))
 
 
 def _earlier_fit(store: Store, keys: Sequence[str], run: Run, states: Sequence[State]):
