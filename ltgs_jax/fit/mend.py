@@ -25,9 +25,9 @@ _LAST = 0.1  # of all rates, what is left of them at the end
 class MendConfig:
     """How what the first visit hardly showed is mended, by photographs of later visits."""
 
-    share: float = 0.1
-    """Of what photographs of later visits show of the background, the share which those of the first visit show less of
-    than they do, from which on it is mended; above 1: never."""
+    share: float = 0.05
+    """Of what photographs of later visits show of the background, the share which those of the first visit together
+    show less than half as much of, from which on it is mended; above 1: never."""
     passes: int = 60
     """How often each photograph of a later visit is looked at; 0: nothing is mended."""
     replay: float = 0.67

@@ -112,12 +112,12 @@ def _numbers(splats: Splats) -> int:
     return splats.count * (each - more) + shining * more
 
 
-def small_views(views: Sequence[VisitView]) -> list[VisitView]:
-    """Views as small as still tells what something buys: halved while their longer side keeps `_ENOUGH` pixels."""
+def small_views(views: Sequence[VisitView], enough: int = _ENOUGH) -> list[VisitView]:
+    """Views as small as still tells what something buys: halved while their longer side keeps `enough` pixels."""
     small = []
     for v in views:
         view = v.view
-        while max(view.camera.width, view.camera.height) >= 2 * _ENOUGH:
+        while max(view.camera.width, view.camera.height) >= 2 * enough:
             (view,) = halved([view])
         small.append(VisitView(view, v.visit))
     return small

@@ -13,7 +13,8 @@ from .ledger import small_views
 from .looks import Eye
 from .state import composed
 
-_SAMPLE = 12  # photographs of the first visit that tell what it showed
+_TIMES = 0.5  # of what later photographs show of a splat, up to which the first visit's together hardly showed it
+_TELLS = 160  # pixels along the longer side of a photograph that tell how much of a splat it shows
 _MOSTLY = 0.5  # share of a pixel's colour that splats must give for it to be theirs
 _ROBUST = 1.4826  # deviation of a normal distribution over its median absolute one
 
@@ -21,21 +22,19 @@ _ROBUST = 1.4826  # deviation of a normal distribution over its median absolute 
 def barely_shown(
     chronology: Chronology, first: Sequence[VisitView], later: Sequence[VisitView], eye: Eye
 ) -> tuple[Bool[np.ndarray, " n"], float]:
-    """Which of the background's splats that were there at the first visit all its photographs together show less of
-    than those of later visits do (Σ αT over pixels that count); and their share of what these show."""
-    sampled = first[:: max(1, len(first) // _SAMPLE)]
-    before = _shown(chronology, sampled, eye) * len(first) / len(sampled)
-    after = _shown(chronology, later, eye)
+    """Which of the background's splats that were there at the first visit all its photographs together show less than
+    half as much of as those of later visits do (Σ αT over pixels that count); and their share of what these show."""
+    before, after = _shown(chronology, first, eye), _shown(chronology, later, eye)
     if chronology.since is not None:
         after = after * (np.asarray(chronology.since) == 0)
-    barely = before < after
+    barely = before < _TIMES * after
     return barely, float(after[barely].sum() / max(after.sum(), 1e-12))
 
 
 def _shown(chronology: Chronology, views: Sequence[VisitView], eye: Eye) -> Float[np.ndarray, " n"]:
     """What photographs, made small, show of each of the background's splats."""
     total, scenes = np.zeros(chronology.background.count), {}
-    for v in small_views(views):
+    for v in small_views(views, _TELLS):
         if v.visit not in scenes:
             scenes[v.visit] = composed(chronology, v.visit)
         mask = np.asarray(v.view.mask, np.float32)[..., None]
