@@ -83,6 +83,12 @@ def test_every_file_of_the_contract_is_there(run, capture):
     assert all(row["status"] == "done" for row in stages)
 
 
+def test_what_was_known_well_is_not_mended_and_the_stage_says_so(run):
+    counts = next(row for row in read_json(run / "stages.json", list) if row["stage"] == "mend")["counts"]
+    assert 0 <= counts["unknown"] < CONFIG.fit.mend.share
+    assert counts["steps"] == 0
+
+
 def test_exported_visit_renders_like_the_composed_one(run, capture):
     chronology = load_chronology(run)
     _, cameras = read_cameras(run)
