@@ -129,10 +129,14 @@ def update(
             accounts.append(told)
             fits.append(digest(key, "fit", config.fit.long))
         key, state = fits[-1], states[-1]
-        later = cache(lambda: _later_views(run, state.chronology, eye, progress))  # once for both stages
-        chronology = _long_fit(store, fits, run, states, later, eye, progress)
+        # Once for all stages that follow.
+        first, later = (
+            cache(lambda: _first_views(run, progress)),
+            cache(lambda: _later_views(run, state.chronology, eye, progress)),
+        )
+        chronology = _long_fit(store, fits, run, states, first, later, eye, progress)
         key = digest(key, "mend", config.fit.mend)
-        chronology = _mend(store, key, run, chronology, later, eye, progress)
+        chronology = _mend(store, key, run, chronology, first, later, eye, progress)
         _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
@@ -272,7 +276,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
 
 
 def _long_fit(
-    store: Store, keys: Sequence[str], run: Run, states: Sequence[State], later, eye: Eye, progress
+    store: Store, keys: Sequence[str], run: Run, states: Sequence[State], first, later, eye: Eye, progress
 ) -> Chronology:
     """The chronology with everything fitted together; skipped, and said so, when nothing changed. From what a fit left
     on disk of fewer visits (by the keys of each number of them) it goes on: the visits since then alone are new."""
@@ -294,10 +298,9 @@ def _long_fit(
             progress.note(f"going on from the fit of the visits before {names}")
         fitted, losses, idle = lean, np.zeros(0), np.zeros((~gone).sum(), bool)
         if earlier is None or not eqx.tree_equal(states[since - 1], state):
-            first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
             chronology, losses = fit_chronology(
                 lean.chronology,
-                first + later(),
+                first() + later(),
                 key=jax.random.key(run.seed + since),
                 since=since,
                 config=config.fit.long,
@@ -316,25 +319,25 @@ def _long_fit(
     return unpack_state(arrays, notes, run.capture.visits).chronology
 
 
-def _mend(store: Store, key: str, run: Run, chronology: Chronology, later, eye: Eye, progress) -> Chronology:
+def _mend(store: Store, key: str, run: Run, chronology: Chronology, first, later, eye: Eye, progress) -> Chronology:
     """The chronology with its background fitted on, where photographs of later visits show much that those of the first
     hardly did; skipped, and said so, where they do not."""
     config = run.config.fit.mend
 
     def compute():
-        background = chronology.background
-        if not chronology.templates:
-            return arrays_of("background", background), {"mended": False, "counts": {"steps": 0}}
-        first = [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-        barely, share = barely_shown(chronology, first, later(), eye)
-        if share < config.share or config.passes == 0:
-            progress.note(f"{100 * share:.0f} % of what later photographs show was hardly shown before: not mended")
-            counts = {"unknown": round(share, 4), "steps": 0}
-            return arrays_of("background", background), {"mended": False, "counts": counts}
-        progress.note(f"{100 * share:.0f} % of what later photographs show was hardly shown before: mending it")
+        if not chronology.templates or not first() or not later():
+            return {}, {"mended": False, "counts": {"steps": 0}}
+        barely, share = barely_shown(chronology, first(), later(), eye)
+        known = share < config.share or config.passes == 0
+        progress.note(
+            f"{100 * share:.0f} % of what later photographs show was hardly shown at the first visit: "
+            + ("not mended" if known else "mending it")
+        )
+        if known:
+            return {}, {"mended": False, "counts": {"unknown": round(share, 4), "steps": 0}}
         found = mend_background(
             chronology,
-            first + without_unexplained(chronology, barely, later(), eye, sigmas=run.config.detect.sigmas),
+            first() + without_unexplained(chronology, barely, later(), eye, sigmas=run.config.detect.sigmas),
             key=jax.random.key(run.seed),
             config=config,
             progress=progress.step,
@@ -346,8 +349,8 @@ def _mend(store: Store, key: str, run: Run, chronology: Chronology, later, eye: 
         )
         errors = {"held_out": found.unseen, "first_visit": found.first}
         counts = {"unknown": round(share, 4), "steps": len(found.losses), "kept": int(found.kept)}
-        mended = jax.tree.map(np.asarray, found.chronology.background)
-        return arrays_of("background", mended), {"mended": found.kept, "errors": errors, "counts": counts}
+        arrays = arrays_of("background", jax.tree.map(np.asarray, found.chronology.background)) if found.kept else {}
+        return arrays, {"mended": found.kept, "errors": errors, "counts": counts}
 
     arrays, notes = store.run("mend", key, compute)
     if not notes["mended"]:
@@ -364,6 +367,11 @@ def _earlier_fit(store: Store, keys: Sequence[str], run: Run, states: Sequence[S
             arrays, notes = found
             return t + 1, (merge_ground(states[t]), unpack_state(arrays, notes, run.capture.visits), arrays["gone"])
     return 1, None
+
+
+def _first_views(run: Run, progress) -> list[VisitView]:
+    """The photographs of the first visit that it was fitted to."""
+    return [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
 
 
 def _later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[VisitView]:
