@@ -133,7 +133,10 @@ def forget_one(stages: Path) -> None:
     arrays = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 (no mapping)
     del arrays[f"template{again[0]}.support"]
     save_file(arrays, visits[0], content.metadata())
-    for path in (*visits[1:], *(stages / f"{name}.safetensors" for name in ("fit", "ledger", "outputs", "evaluate"))):
+    for path in (
+        *visits[1:],
+        *(stages / f"{name}.safetensors" for name in ("fit", "mend", "ledger", "outputs", "evaluate")),
+    ):
         path.unlink(missing_ok=True)
 
 
