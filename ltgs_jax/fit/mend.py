@@ -34,8 +34,8 @@ class MendConfig:
     """Share of the steps spent on photographs of the first visit, against forgetting."""
     dssim: float = 0.2
     """λ, the weight of 1 − SSIM in the loss."""
-    rates: Rates = field(default_factory=lambda: Rates(means=2e-4, means_final=2e-4))
-    """All of them fall to a tenth over the steps."""
+    rates: Rates = field(default_factory=lambda: Rates(means_final=4e-4))
+    """Those that the first fit begins with; all of them fall to a tenth over the steps."""
 
 
 class Mended(eqx.Module):
