@@ -1,10 +1,12 @@
 """The converters of foreign data sets into captures."""
 
+import json
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from experiments import convert_paslcd, convert_redkitchen
+from experiments import convert_livingroom, convert_paslcd, convert_redkitchen
 from ltgs_jax import io
 from ltgs_jax.io.colmap import ColmapImage, ColmapModel
 from ltgs_jax.io.lens import CameraModel
@@ -35,6 +37,36 @@ def test_paslcd_keeps_poses_under_new_names(tmp_path):
         convert_paslcd.convert(source, out)
     with pytest.raises(io.InputError, match="has no inst1"):
         convert_paslcd.convert(tmp_path, tmp_path / "other")
+
+
+def test_frames_of_the_living_room_are_scored_from_their_own_cameras(tmp_path):
+    source, out = tmp_path / "source", tmp_path / "out"
+    none = np.zeros((0, 2)), np.zeros(0, np.int64)
+    lens = CameraModel("SIMPLE_RADIAL", 16, 12, (20.0, 8.0, 6.0, 0.0))
+    images = {1: ColmapImage("IMG_0000/0000.jpg", 1, np.array([1.0, 0, 0, 0]), np.zeros(3), *none)}
+    for name in ("images/IMG_0000/0000.jpg", "images/IMG_0001/0000.jpg", "reference/IMG_0001/0042.jpg"):
+        io.write_image(source / name, np.full((12, 16, 3), 0.5))
+    io.write_labels(source / "masks" / "IMG_0000" / "0000.jpg.png", np.full((12, 16), 255))
+    pose = {"wxyz": [1, 0, 0, 0], "xyz": [7, 0, 0], "model": lens.model, "width": 16, "height": 12}
+    poses = {"IMG_0001/0042.jpg": {**pose, "params": list(lens.params)}}
+    (source / "reference" / "poses.json").write_text(json.dumps(poses))
+    empty = np.zeros((0, 3))
+    model = ColmapModel(
+        {1: lens}, images, np.zeros(0, int), empty, empty.astype(np.uint8), np.zeros(0), np.zeros((0, 3), int)
+    )
+    io.write_colmap(source / "sparse" / "0", model)
+    convert_livingroom.convert(source, out)
+    photographs = {p.name: p for p in io.read_capture(out).photographs}
+    frame = photographs["IMG_0001/reference_0042.jpg"]
+    assert {name: p.role for name, p in photographs.items()} == {
+        "IMG_0000/0000.jpg": "test",
+        "IMG_0001/0000.jpg": "update",
+        frame.name: "test",
+    }
+    assert float(frame.camera.cam_from_world.xyz[0]) == 7
+    assert frame.mask_path is not None
+    with pytest.raises(io.InputError, match="already holds"):
+        convert_livingroom.convert(source, out)
 
 
 def test_redkitchen_points_lie_on_the_depth(tmp_path):
