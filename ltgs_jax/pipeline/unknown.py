@@ -51,11 +51,9 @@ def without_unexplained(
     kept = []
     for v in views:
         scene, view = composed(chronology, v.visit), v.view
-        flags = np.zeros((scene.count, 1), np.float32)
-        flags[: len(barely), 0] = barely
-        look = eye.look(scene, view.camera, flags[:, 0])
-        painted = eye.paint(scene, view.camera, flags)[..., 0]
-        known = view.mask & (painted < _MOSTLY) & (look.alpha > _MOSTLY)
+        doubt = np.pad(barely.astype(np.float32), (0, scene.count - len(barely)))
+        look = eye.look(scene, view.camera, doubt)
+        known = view.mask & (look.alpha > _MOSTLY) & (look.expected < _MOSTLY)
         difference = colour_difference(look.image, np.asarray(view.image, np.float32) / 255)
         usual = np.median(difference[known]) if known.any() else 0.0
         spread = _ROBUST * np.median(np.abs(difference[known] - usual)) if known.any() else 0.0
