@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Bool
 
 from ltgs_jax.render import RenderPlan, render
 from ltgs_jax.scene import Chronology, Splats, compose
@@ -15,10 +15,12 @@ from ltgs_jax.scene import Chronology, Splats, compose
 from .loss import photometric_loss
 from .optimizer import Rates, adam, scale_gradients
 from .schedule import held_out
-from .views import VisitView, plan_for, scene_extent, size_of
+from .views import VisitView, halved, plan_for, scene_extent, size_of
 
 _FORGET = 1.01  # growth of the first visit's error from which on what was mended is not kept
 _LAST = 0.1  # of all rates, what is left of them at the end
+_COARSE = 0.7  # share of the steps on photographs of half the size, where these keep as many pixels as follow
+_ENOUGH = 320  # along the longer side
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,15 @@ def _error(chronology: Chronology, background: Splats, visit, camera, image, mas
     return photometric_loss(out.image, image.astype(jnp.float32) / 255, mask, dssim=0)
 
 
+def _smaller(seen: VisitView, left_out: Bool[np.ndarray, "h w"]) -> tuple[VisitView, Bool[np.ndarray, "h w"]]:
+    """A photograph and what of it is left out at half the size, where that is enough; else as they are."""
+    if max(size_of(seen.view)) < 2 * _ENOUGH:
+        return seen, left_out
+    (view,) = halved([seen.view])
+    width, height = size_of(view)
+    return VisitView(view, seen.visit), left_out[: 2 * height : 2, : 2 * width : 2]
+
+
 def mend_background(
     chronology: Chronology,
     views: Sequence[VisitView],
@@ -91,8 +102,8 @@ def mend_background(
     config: MendConfig = MendConfig(),
     progress: Callable[[int, int, str], None] = lambda i, n, text: None,
 ) -> Mended:
-    """Fit the background's splats to whole photographs of all visits, by L1 + D-SSIM and Adam; templates, poses, shades
-    and shadows stay. No splat is added or removed.
+    """Fit the background's splats to whole photographs of all visits, by L1 + D-SSIM and Adam, large ones at half their
+    size at first; templates, poses, shades and shadows stay. No splat is added or removed.
 
     Of photographs of later visits squares are held out; what came of it is kept where the error there fell and the
     first visit's did not grow by more than a hundredth. Raises ValueError without photographs of both.
@@ -104,6 +115,9 @@ def mend_background(
         )
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     held = [held_out((v.view.camera.height, v.view.camera.width), rng) for v in later]
+    none = [np.zeros((v.view.camera.height, v.view.camera.width), bool) for v in first]
+    fine = {"first": list(zip(first, none, strict=True)), "later": list(zip(later, held, strict=True))}
+    coarse = {name: [_smaller(*pair) for pair in pairs] for name, pairs in fine.items()}
     chronology = jax.tree.map(jnp.asarray, chronology)
     background = jax.tree.map(jnp.copy, chronology.background)  # the steps donate their buffers
     extent = jnp.asarray(scene_extent([v.view.camera for v in first]), jnp.float32)
@@ -111,8 +125,9 @@ def mend_background(
 
     def replan(background: Splats) -> None:
         scenes = {t: _scene(chronology, background, jnp.asarray(t)) for t in {v.visit for v in views}}
-        for size in {size_of(v.view) for v in views}:
-            pairs = [(scenes[v.visit], v.view.camera) for v in views if size_of(v.view) == size]
+        every = [v for sized in (fine, coarse) for pairs in sized.values() for v, _ in pairs]
+        for size in {size_of(v.view) for v in every}:
+            pairs = [(scenes[v.visit], v.view.camera) for v in every if size_of(v.view) == size]
             plans[size] = plan_for(pairs, slack=2.5)
 
     def errors(background: Splats) -> tuple[float, float]:
@@ -131,14 +146,13 @@ def mend_background(
     state, queues = adam().init(background), {"first": [], "later": []}
     for step in range(steps):
         name = "first" if rng.random() < config.replay else "later"
-        every = first if name == "first" else later
+        every = (coarse if step < _COARSE * steps else fine)[name]
         queues[name] = queues[name] or rng.permutation(len(every)).tolist()
-        i = queues[name].pop()
-        v, size = every[i].view, size_of(every[i].view)
-        mask = v.mask if name == "first" else v.mask & ~held[i]
-        at = jnp.asarray(step / steps, jnp.float32)
-        inputs = (chronology, jnp.asarray(every[i].visit), v.camera, v.image, mask, extent, at)
-        background, state, loss, overflow = _step(inputs, background, state, config.rates, config.dssim, plans[size])
+        seen, left_out = every[queues[name].pop()]
+        v, at = seen.view, jnp.asarray(step / steps, jnp.float32)
+        inputs = (chronology, jnp.asarray(seen.visit), v.camera, v.image, v.mask & ~left_out, extent, at)
+        plan = plans[size_of(v)]
+        background, state, loss, overflow = _step(inputs, background, state, config.rates, config.dssim, plan)
         losses[step] = loss
         if not np.isfinite(losses[step]):
             progress(step, steps, "the loss is not finite: nothing is mended")
