@@ -12,11 +12,11 @@ from ltgs_jax.fit import MendConfig, View, VisitView, mend_background
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.pipeline.looks import Eye
 from ltgs_jax.pipeline.unknown import barely_shown, without_unexplained
-from ltgs_jax.render import render
 from ltgs_jax.scene import Chronology, Splats, Template, compose
 
 _SIZE = 32
 _CONFIG = MendConfig(passes=40)
+_EYE = Eye()  # one program for all images
 
 
 def _camera(x: float) -> Camera:
@@ -34,8 +34,8 @@ def _wall(seed: int) -> Splats:
     return Splats(
         means=jnp.asarray(np.stack([x, y, np.zeros(count)], axis=-1), jnp.float32),
         quats=jnp.tile(jnp.asarray([[1.0, 0, 0, 0]]), (count, 1)),
-        log_scales=jnp.full((count, 3), -2.2),
-        logit_opacities=jnp.full(count, 2.0),
+        log_scales=jnp.full((count, 3), -2.2, jnp.float32),
+        logit_opacities=jnp.full(count, 2.0, jnp.float32),
         sh=jnp.asarray(rng.uniform(-1, 1, (count, 1, 3)), jnp.float32),
     )
 
@@ -57,7 +57,7 @@ def _photographs(truth: Chronology) -> list[VisitView]:
     at = [(0, x) for x in (-0.2, 0.0, 0.2)] + [(1, x) for x in (0.0, -3.9, -4.1)]
     views = []
     for t, x in at:
-        image = np.clip(np.asarray(render(compose(truth, t), _camera(x)).image), 0, 1)
+        image = _EYE.image(compose(truth, t), _camera(x))
         pixels = np.rint(255 * image).astype(np.uint8)
         views.append(VisitView(View(_camera(x), pixels, np.ones((_SIZE, _SIZE), bool)), t))
     return views
@@ -73,7 +73,7 @@ def _unknown_beyond() -> tuple[Chronology, list[VisitView]]:
 
 
 def _error(chronology: Chronology, views, t: int) -> float:
-    images = [(np.asarray(render(compose(chronology, t), v.view.camera).image), v.view) for v in views if v.visit == t]
+    images = [(_EYE.image(compose(chronology, t), v.view.camera), v.view) for v in views if v.visit == t]
     return float(np.mean([np.abs(image - v.image / 255.0).mean() for image, v in images]))
 
 
@@ -121,22 +121,22 @@ def test_mending_asks_for_photographs_of_both():
 
 def test_the_unknown_is_what_later_photographs_show_more_of_than_all_of_the_first():
     chronology, views = _unknown_beyond()
-    barely, share = barely_shown(chronology, views[:3], views[3:], Eye())
+    barely, share = barely_shown(chronology, views[:3], views[3:], _EYE)
     beyond = np.asarray(chronology.background.means)[:, 0] > 2
     assert (barely & ~beyond).sum() < 8  # of 144: those at the edge
     assert (barely & beyond).sum() > 0.5 * beyond.sum()
     assert 0.5 < share < 0.8  # two of three photographs
-    assert barely_shown(chronology, views[:3], views[3:4], Eye())[1] < 0.05
+    assert barely_shown(chronology, views[:3], views[3:4], _EYE)[1] < 0.05
 
 
 def test_a_change_that_nobody_explained_is_left_out_but_not_where_nobody_knew_better():
     chronology, views = _unknown_beyond()
     later = views[3:]
-    barely, _ = barely_shown(chronology, views[:3], later, Eye())
+    barely, _ = barely_shown(chronology, views[:3], later, _EYE)
     image = later[0].view.image.copy()
     image[10:16, 10:16] = np.where(image[10:16, 10:16] < 128, 255, 0)
     later[0] = VisitView(dataclasses.replace(later[0].view, image=image), 1)
-    kept = without_unexplained(chronology, barely, later, Eye(), sigmas=5.0)
+    kept = without_unexplained(chronology, barely, later, _EYE, sigmas=5.0)
     assert kept[0].view.mask[11:15, 11:15].mean() < 0.3
     assert kept[0].view.mask[:8].all()
     assert all(v.view.mask.all() for v in kept[1:])

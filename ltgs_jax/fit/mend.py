@@ -128,7 +128,9 @@ def mend_background(
         every = [v for sized in (fine, coarse) for pairs in sized.values() for v, _ in pairs]
         for size in {size_of(v.view) for v in every}:
             pairs = [(scenes[v.visit], v.view.camera) for v in every if size_of(v.view) == size]
-            plans[size] = plan_for(pairs, slack=2.5)
+            needed, held_plan = plan_for(pairs, slack=1.0), plans.get(size)
+            if held_plan is None or needed.intersections > held_plan.intersections or needed.rounds > held_plan.rounds:
+                plans[size] = plan_for(pairs, slack=2.5)
 
     def errors(background: Splats) -> tuple[float, float]:
         """Of what is held out, and of the first visit's photographs."""
