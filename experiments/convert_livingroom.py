@@ -9,13 +9,12 @@ visit's first photograph is that of each frame.
 """
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
 import tyro
 
-from experiments.convert_paslcd import link
+from experiments.convert_paslcd import ends_in_one_line, link
 from ltgs_jax import io
 from ltgs_jax.io.colmap import ColmapImage
 from ltgs_jax.io.lens import CameraModel
@@ -55,10 +54,8 @@ def convert(source: Path, out: Path) -> None:
 
 def main(source: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
     """Convert the living room in SOURCE to a capture in OUT."""
-    try:
+    with ends_in_one_line("convert_livingroom"):
         convert(source, out)
-    except io.InputError as error:
-        sys.exit(f"convert_livingroom: {error}")
 
 
 if __name__ == "__main__":

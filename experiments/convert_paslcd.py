@@ -11,6 +11,8 @@ import dataclasses
 import os
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import tyro
@@ -27,6 +29,15 @@ def link(source: Path, target: Path) -> None:
         os.symlink(source.resolve(), target)
     except OSError:
         shutil.copyfile(source, target)
+
+
+@contextmanager
+def ends_in_one_line(name: str) -> Iterator[None]:
+    """What is wrong with the input ends the program `name` with its message."""
+    try:
+        yield
+    except io.InputError as error:
+        sys.exit(f"{name}: {error}")
 
 
 def convert(source: Path, out: Path) -> None:
@@ -54,10 +65,8 @@ def convert(source: Path, out: Path) -> None:
 
 def main(source: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path]) -> None:
     """Convert a PASLCD scene in SOURCE to a capture in OUT."""
-    try:
+    with ends_in_one_line("convert_paslcd"):
         convert(source, out)
-    except io.InputError as error:
-        sys.exit(f"convert_paslcd: {error}")
 
 
 if __name__ == "__main__":

@@ -6,14 +6,13 @@ The depth gives the sparse points that structure from motion would: a subsample 
 other frames' depths agree, and observed there. Depth is used for nothing else.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from experiments.convert_paslcd import link
+from experiments.convert_paslcd import ends_in_one_line, link
 from ltgs_jax import io
 
 VISIT = "IMG_0000"
@@ -112,10 +111,8 @@ def convert(source: Path, out: Path, *, points: int = 20000, tolerance: float = 
 
 def main(source: tyro.conf.Positional[Path], out: tyro.conf.Positional[Path], points: int = 20000) -> None:
     """Convert the RGB-D sequence in SOURCE to a capture in OUT with at most POINTS sparse points."""
-    try:
+    with ends_in_one_line("convert_redkitchen"):
         convert(source, out, points=points)
-    except io.InputError as error:
-        sys.exit(f"convert_redkitchen: {error}")
 
 
 if __name__ == "__main__":

@@ -130,10 +130,8 @@ def update(
             fits.append(digest(key, "fit", config.fit.long))
         key, state = fits[-1], states[-1]
         # Once for all stages that follow.
-        first, later = (
-            cache(lambda: _first_views(run, progress)),
-            cache(lambda: _later_views(run, state.chronology, eye, progress)),
-        )
+        first = cache(lambda: _first_views(run, progress))
+        later = cache(lambda: _later_views(run, state.chronology, eye, progress))
         chronology = _long_fit(store, fits, run, states, first, later, eye, progress)
         key = digest(key, "mend", config.fit.mend)
         chronology = _mend(store, key, run, chronology, first, later, eye, progress)
@@ -325,10 +323,10 @@ def _mend(store: Store, key: str, run: Run, chronology: Chronology, first, later
     config = run.config.fit.mend
 
     def compute():
-        if not chronology.templates or not first() or not later():
+        if config.passes == 0 or not chronology.templates or not first() or not later():
             return {}, {"mended": False, "counts": {"steps": 0}}
         barely, share = barely_shown(chronology, first(), later(), eye)
-        known = share < config.share or config.passes == 0
+        known = share < config.share
         progress.note(
             f"{100 * share:.0f} % of what later photographs show was hardly shown at the first visit: "
             + ("not mended" if known else "mending it")
