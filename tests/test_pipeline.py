@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ from tiny_capture import write_tiny_capture
 
 from ltgs_jax import pipeline
 from ltgs_jax.demo import make_capture
+from ltgs_jax.fit.mend import Mended
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
 from ltgs_jax.localize import Localization
@@ -87,6 +89,38 @@ def test_what_was_known_well_is_not_mended_and_the_stage_says_so(run):
     counts = next(row for row in read_json(run / "stages.json", list) if row["stage"] == "mend")["counts"]
     assert 0 <= counts["unknown"] < CONFIG.fit.mend.share
     assert counts["steps"] == 0
+
+
+def test_a_mended_scene_tells_the_visits_again_and_resumes(run, capture, tmp_path, monkeypatch):
+    update = importlib.import_module("ltgs_jax.pipeline.update")
+    mended = []
+
+    def mend(chronology, views, **_):
+        background = chronology.background
+        darker = eqx.tree_at(lambda s: s.sh, background, background.sh - 1e-3)
+        mended.append(len(views))
+        return Mended(eqx.tree_at(lambda c: c.background, chronology, darker), (0.2, 0.1), (0.2, 0.1), np.ones(1), True)
+
+    monkeypatch.setattr(update, "mend_background", mend)
+    out, progress = tmp_path / "out", Quiet()
+    shutil.copytree(run, out)
+    config = replace(CONFIG, fit=replace(CONFIG.fit, mend=replace(CONFIG.fit.mend, share=0.0)))
+    chronology = pipeline.update(capture, out, config=config, progress=progress)
+    assert "visit_001: taken from disk" in progress.lines and len(mended) == 2
+    stages = [row["stage"] for row in read_json(out / "stages.json", list)]
+    told = ["visit_001", "fit", "mend"]
+    assert stages[3:] == [*told, *(f"again_{name}" for name in ("initial", *told)), "ledger", "outputs", "evaluate"]
+    first = read_ply(run / "splats" / f"{capture.name}_0000.ply")
+    assert compose(chronology, 0).sh.mean() < first.sh.mean() - 1.5e-3  # mended twice
+    assert [item["states"][0]["event"] for item in read_tracks(out / "tracks.json")["objects"]] == ["moved"]
+    progress = Quiet()
+    pipeline.update(capture, out, config=config, progress=progress)
+    assert {"mend: taken from disk", "again_visit_001: taken from disk", "again_mend: taken from disk"} <= set(
+        progress.lines
+    )
+    once = replace(config, fit=replace(config.fit, mend=replace(config.fit.mend, again=False)))
+    pipeline.update(capture, tmp_path / "once", config=once, progress=Quiet())
+    assert not list((tmp_path / "once" / "stages").glob("again_*"))
 
 
 def test_exported_visit_renders_like_the_composed_one(run, capture):
@@ -354,6 +388,11 @@ def test_a_thing_stands_on_its_surface_and_neither_floats_nor_clings():
     assert not _stands(state, 1, box(200, [-0.5, -0.1, 0.1], [-0.3, 0.1, 0.3]), support)
     # What stands so close that it touches is a thing all the same.
     assert _stands(state, 1, box(200, [0.1, -0.1, 0], [0.3, 0.1, 0.2]), support)
+    # A sheet on the ground clings to nothing, however close what stands there is to the little of it that is higher.
+    sheet = concatenate_splats(
+        [box(190, [-0.3, -0.3, 0], [0.3, 0.3, 0.01]), box(10, [0.28, -0.1, 0.1], [0.3, 0.1, 0.1])]
+    )
+    assert _stands(state, 1, sheet, support)
 
 
 def test_a_pose_of_now_that_a_visit_before_likes_as_well_was_the_pose_then():

@@ -133,11 +133,10 @@ def forget_one(stages: Path) -> None:
     arrays = {name: content.get_tensor(name) for name in content.keys()}  # noqa: SIM118 (no mapping)
     del arrays[f"template{again[0]}.support"]
     save_file(arrays, visits[0], content.metadata())
-    for path in (
-        *visits[1:],
-        *(stages / f"{name}.safetensors" for name in ("fit", "mend", "ledger", "outputs", "evaluate")),
-    ):
-        path.unlink(missing_ok=True)
+    kept = {"localize", "initial", "align", visits[0].stem}
+    for path in stages.glob("*.safetensors"):
+        if path.stem not in kept:
+            path.unlink()
 
 
 def _read_stage(path: Path):

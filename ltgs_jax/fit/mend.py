@@ -36,6 +36,8 @@ class MendConfig:
     """Share of the steps spent on photographs of the first visit, against forgetting."""
     dssim: float = 0.2
     """λ, the weight of 1 − SSIM in the loss."""
+    again: bool = True
+    """Whether the visits are explained, fitted and mended a second time, from the mended first scene."""
     rates: Rates = field(default_factory=lambda: Rates(means_final=4e-4))
     """Those that the first fit begins with; all of them fall to a tenth over the steps."""
 

@@ -52,7 +52,7 @@ _MOST = 1.3  # share of the change that an account of it may explain: beyond, it
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
-_SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
+_SHOWN = 0.3  # share of a new object that must show: what lies in and under what was known is no object
 _COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
 _BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
 _APART = 0.2  # share of the smaller of two outlines, up to which they may overlap and be of things side by side
@@ -60,6 +60,7 @@ _COMPACT = 0.6  # share of its convex hull that an outline fills, from which on 
 _CLINGS = 0.3  # distance, in sizes of a new object, to what stands there, within which it is a patch of that
 _FLOATS = 0.25  # height of the lowest of a new object, in its sizes, from which on nothing carries it
 _SHADE_LENGTH = 2.0  # in sizes of an object: how far from its middle its shadow reaches
+_FLAT = 0.2  # share of a new object above that height, below which it lies flat on its surface and clings to nothing
 _LOW = 0.1  # height, in diameters of a new object, under which what mends the surface around it belongs to that
 
 
@@ -78,13 +79,15 @@ class Arrival(eqx.Module):
 
 class NewObject(eqx.Module):
     """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
-    in the windows, what is left unlike the photographs, and the share of the change that it explains."""
+    in the windows, what is left unlike the photographs, and the share of the change that it explains, and that what it
+    draws within its outlines does."""
 
     template: Template
     firm: Bool[np.ndarray, " n"]
     outlines: Bool[np.ndarray, "v s s"]
     error: float
     gain: float
+    own_gain: float
 
 
 Unknown = tuple[Arrival, NewObject | None, tuple[int, ...]]
@@ -380,8 +383,11 @@ def _as_new(
     )
     if template is None:
         return None
-    template, error, gain = _settle_new(template, arrival.crop, config)
-    return NewObject(template, *firm_part(template.splats, arrival.crop), error, gain)
+    template, images, error, gain = _settle_new(template, arrival.crop, config)
+    firm, outlines = firm_part(template.splats, arrival.crop)
+    # What it draws beside its outlines mends what is around it, where the scene was poorly known.
+    within = np.where(np.stack([dilate(outline, 2) for outline in outlines])[..., None], images, arrival.crop.backdrop)
+    return NewObject(template, firm, outlines, error, gain, explained(within, arrival.crop)[1])
 
 
 def _unsure(placements: dict[tuple[int, int], Placement], config: Config) -> dict[tuple[int, int], Placement]:
@@ -432,7 +438,8 @@ def _add_new(
     if new is None:
         return state, None
     if not _explains(new, config):
-        progress.note(f"visit {t}: a change left out, as a new object it explains {new.gain:.2f} of it")
+        gains = f"{new.gain:.2f} of it, {new.own_gain:.2f} within its outlines"
+        progress.note(f"visit {t}: a change left out, as a new object it explains {gains}")
         return state, None
     doubt, splats = 0.5 * config.detect.guessed, new.template.splats
     views = arrival.instance.views
@@ -466,7 +473,7 @@ def _add_new(
 
 def _explains(new: NewObject, config: Config) -> bool:
     """Whether a new object explains as much of the change as it must, and no more than there is."""
-    return config.template.tau_new <= new.gain <= _MOST
+    return new.gain >= config.template.tau_new and new.own_gain <= _MOST
 
 
 def _ground(state: State, t: int, arrival: Arrival, firm: Splats) -> tuple[bool | None, float]:
@@ -520,7 +527,7 @@ def _stands(state: State, t: int, piece: Splats, support: Support) -> bool:
         return means[(np.asarray(splats.opacities) > 0.3) & (support.height(means) > _LOW * size)]
 
     body, standing = above(piece), above(scene_at(state, t)[0])
-    if not len(body) or not len(standing):
+    if len(body) < _FLAT * piece.count or not len(standing):
         return True
     return float(np.median(cKDTree(standing).query(body)[0])) > _CLINGS * size
 
@@ -541,19 +548,22 @@ def _part_of(state: State, t: int, piece: Splats) -> int | None:
     return None
 
 
-def _settle_new(template: Template, crop: Crop, config: Config) -> tuple[Template, float, float]:
-    """A new object after a short fit in its windows, what is left unlike the photographs, and the share of the change
-    that it explains; splats that the photographs do not support fade and are dropped."""
+def _settle_new(
+    template: Template, crop: Crop, config: Config
+) -> tuple[Template, Float[np.ndarray, "v s s 3"], float, float]:
+    """A new object after a short fit in its windows, those with it, what is left unlike the photographs, and the share
+    of the change that it explains; splats that the photographs do not support fade and are dropped."""
     size = template_diameter(template.splats)
     padded = pad_splats(template.splats, config.template.new_splats)
-    windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
+    depth = jnp.where(crop.region, 0, crop.depth)  # where the photograph shows it, nothing that is known hides it
+    windows = Windows(crop.camera, crop.target, crop.backdrop, depth, crop.valid)
     splats, _, images = fit_local(padded, windows, size=size, steps=config.template.new_steps)
     error, gain = explained(images, crop)
     splats = splats[: template.splats.count]
     keep = np.asarray(splats.opacities) > 0.02
     if keep.sum() < 8:
-        return template, error, 0.0
-    return eqx.tree_at(lambda m: m.splats, template, splats[keep]), error, gain
+        return template, images, error, 0.0
+    return eqx.tree_at(lambda m: m.splats, template, splats[keep]), images, error, gain
 
 
 def _places(points: Float[np.ndarray, "n 3"], size: float) -> Float[np.ndarray, "p 3"]:

@@ -6,6 +6,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable
+from copy import copy
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -42,6 +43,8 @@ def digest(*parts: Any) -> str:
 class Store:
     """The stages of one run in `folder`/stages, each a safetensors file with a JSON header, keyed by its inputs."""
 
+    prefix = ""
+
     def __init__(self, folder: Path, progress) -> None:
         self.folder = folder / "stages"
         self.summary = folder / "stages.json"
@@ -54,6 +57,7 @@ class Store:
 
         `compute` returns arrays by name and notes that JSON can hold; notes["counts"] goes to stages.json.
         """
+        name = self.prefix + name
         path, key = self.folder / f"{name}.safetensors", digest(_FORMAT, key)
         self.progress.stage(name)
         found = _read(path, key)
@@ -82,8 +86,14 @@ class Store:
 
     def peek(self, name: str, key: str) -> tuple[dict[str, np.ndarray], dict] | None:
         """The arrays and notes of a stage as it was left by a run with another key; None where it was not."""
-        found = _read(self.folder / f"{name}.safetensors", digest(_FORMAT, key))
+        found = _read(self.folder / f"{self.prefix}{name}.safetensors", digest(_FORMAT, key))
         return None if found is None else (found[0], found[1]["notes"])
+
+    def again(self) -> "Store":
+        """The same run's, for stages that are gone through a second time: `again_` goes before their names."""
+        other = copy(self)
+        other.prefix = "again_"
+        return other
 
     def _row(self, row: dict) -> None:
         self.rows.append(row)

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,7 @@ from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
 from ltgs_jax.fit import (
     Budget,
+    InitialConfig,
     StreamedView,
     View,
     VisitView,
@@ -117,28 +118,52 @@ def update(
         splats, errors = _initial_scene(store, first, run, scene, front_end, eye, progress)
         key = digest(key, first, *(part for each in poses for part in each))
         run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
-        states = [State.of_initial(splats, errors, capture.visits)]
-        accounts: list[list[Account]] = [[]]
+        photographs = cache(lambda: _first_views(run, progress))  # decoded once for all stages
         key = digest(first, config.detect, config.match, config.template, config.register)
-        fits = [digest(key, "fit", config.fit.long)]
-        for t in visits[1:]:
-            key = digest(key, t, files[t], *run.poses(t))
-            free_programs()
-            state, told, run = _one_visit(store, key, run, states[-1], t, front_end, eye, progress)
-            states.append(state)
-            accounts.append(told)
-            fits.append(digest(key, "fit", config.fit.long))
-        key, state = fits[-1], states[-1]
-        # Once for all stages that follow.
-        first = cache(lambda: _first_views(run, progress))
-        later = cache(lambda: _later_views(run, state.chronology, eye, progress))
-        chronology = _long_fit(store, fits, run, states, first, later, eye, progress)
-        key = digest(key, "mend", config.fit.mend)
-        chronology = _mend(store, key, run, chronology, first, later, eye, progress)
-        _ledger(store, digest(key, "ledger"), chronology, accounts, later, eye, progress)
+        told = _tell(store, key, run, files, splats, errors, photographs, front_end, eye, progress)
+        if told.mended and config.fit.mend.again:
+            key, again = digest(told.key, options), store.again()
+            mended, errors = _mended_scene(again, key, run, told.chronology, photographs, front_end, eye, progress)
+            told = _tell(again, key, run, files, mended, errors, photographs, front_end, eye, progress)
+        run, chronology, accounts = told.run, told.chronology, told.accounts
+        _ledger(store, digest(told.key, "ledger"), chronology, accounts, told.later, eye, progress)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
+
+
+@dataclasses.dataclass(frozen=True)
+class _Told:
+    """What the photographs of all visits tell: the run without those that tell nothing, the chronology, the accounts of
+    each visit, the key of the last stage, the later photographs, and whether the background was mended."""
+
+    run: Run
+    chronology: Chronology
+    accounts: list[list[Account]]
+    key: str
+    later: Callable[[], list[VisitView]]
+    mended: bool
+
+
+def _tell(
+    store: Store, key: str, run: Run, files: Sequence[list], splats: Splats, errors, first, front_end, eye: Eye,
+    progress,
+) -> _Told:  # fmt: skip
+    """All visits explained in turn, against the splats of the first, then fitted together and mended."""
+    config, states, accounts = run.config, [State.of_initial(splats, errors, run.capture.visits)], [[]]
+    fits = [digest(key, "fit", config.fit.long)]
+    for t in range(1, len(files)):
+        key = digest(key, t, files[t], *run.poses(t))
+        free_programs()
+        state, told, run = _one_visit(store, key, run, states[-1], t, front_end, eye, progress)
+        states.append(state)
+        accounts.append(told)
+        fits.append(digest(key, "fit", config.fit.long))
+    later = cache(lambda: _later_views(run, states[-1].chronology, eye, progress))
+    fitted = _long_fit(store, fits, run, states, first, later, eye, progress)
+    key = digest(fits[-1], "mend", config.fit.mend)
+    chronology = _mend(store, key, run, fitted, first, later, eye, progress)
+    return _Told(run, chronology, accounts, key, later, chronology is not fitted)
 
 
 def _files(capture: Capture, visit: int) -> list[tuple]:
@@ -184,38 +209,62 @@ def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tu
 
 def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye, progress):
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
-    config = run.config
-
-    def fit(views, options):
-        start = splats_from_points(
-            run.capture.points,
-            run.capture.point_colors,
-            capacity=options.max_splats,
-            sh_degree=options.sh_degree,
-        )
-        return fit_initial(start, views, key=jax.random.key(run.seed), config=options, progress=progress.step).splats
 
     def compute():
         views = [view for _, view in load_views(run, run.posed(0, "train"), progress)]
-        options, startable = config.fit.initial, len(run.capture.points) >= 4
-        if scene is None and not startable:
+        if scene is None and not _startable(run):
             raise InputError(f"{run.capture.folder}: too few sparse points to start from; give --initial PLY")
-        splats = fit(views, options) if scene is None else scene
-        progress.note("measuring what difference is to be expected")
-        short = dataclasses.replace(options, steps=-(-options.steps // 4), grow_every=-(-options.grow_every // 4))
-        errors = expected_errors(
-            eye,
-            splats,
-            views,
-            front_end,
-            gamma=config.detect.gamma,
-            fit_to=partial(fit, options=short) if startable else None,
-            progress=progress,
-        )
-        return {**arrays_of("splats", splats), "errors": errors}, {"counts": {"splats": splats.count}}
+        splats = _fit_first(run, views, run.config.fit.initial, progress) if scene is None else scene
+        return _with_errors(run, splats, views, front_end, eye, progress)
 
     arrays, _ = store.run("initial", key, compute)
     return module_of(Splats, "splats", arrays), arrays["errors"]
+
+
+def _mended_scene(store: Store, key: str, run: Run, chronology: Chronology, first, front_end, eye: Eye, progress):
+    """As `_initial_scene`, the mended scene of the first visit: what it shows better now tells changes better."""
+
+    def compute():
+        progress.note("the mended scene tells changes better: the visits are explained again")
+        scene = composed(chronology, 0)
+        splats = scene[np.asarray(scene.logit_opacities) > -np.inf]
+        return _with_errors(run, splats, [v.view for v in first()], front_end, eye, progress)
+
+    arrays, _ = store.run("initial", key, compute)
+    return module_of(Splats, "splats", arrays), arrays["errors"]
+
+
+def _with_errors(run: Run, splats: Splats, views, front_end, eye: Eye, progress) -> tuple[dict, dict]:
+    """Splats and what difference is to be expected of each, as a stage leaves them."""
+    options = run.config.fit.initial
+    short = dataclasses.replace(options, steps=-(-options.steps // 4), grow_every=-(-options.grow_every // 4))
+    progress.note("measuring what difference is to be expected")
+    errors = expected_errors(
+        eye,
+        splats,
+        views,
+        front_end,
+        gamma=run.config.detect.gamma,
+        fit_to=partial(_fit_first, run, options=short, progress=progress) if _startable(run) else None,
+        progress=progress,
+    )
+    return {**arrays_of("splats", splats), "errors": errors}, {"counts": {"splats": splats.count}}
+
+
+def _startable(run: Run) -> bool:
+    """Whether there are points enough to fit a scene from."""
+    return len(run.capture.points) >= 4
+
+
+def _fit_first(run: Run, views, options: InitialConfig, progress) -> Splats:
+    """Splats fitted to photographs of the first visit, from its sparse points."""
+    start = splats_from_points(
+        run.capture.points,
+        run.capture.point_colors,
+        capacity=options.max_splats,
+        sh_degree=options.sh_degree,
+    )
+    return fit_initial(start, views, key=jax.random.key(run.seed), config=options, progress=progress.step).splats
 
 
 def _observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observation]:
