@@ -203,6 +203,7 @@ ABLATION = {
     "without background refinement": (("fit.long.background_rate", 0.0),),
     "without photographs of the first visit": (("fit.long.replay", 0.0),),
     "without the long fit": (("fit.long.passes", 0),),
+    "without mending": (("fit.mend.passes", 0),),
 }
 EVIDENCE = {
     "search alone": (("template.matches", False), ("fit.long.passes", 0)),
