@@ -156,10 +156,9 @@ def _put_back(
         alternative = set_from(state, t, k, visible=True, pose=state.chronology.world_from_template[t - 1, k])
         stays, left, stayed, others = judged(alternative)
         if stays:
-            progress.note(
-                f"visit {t}: object {state.chronology.templates[k].identity} stays where it was "
-                f"(unlikeness {stayed:.3f} there, {left:.3f} without)"
-            )
+            told = f"unlikeness {stayed:.3f} there, {left:.3f} without"
+            told += ", too little shows of it to tell" * (stayed > left * (1 + config.template.still_margin))
+            progress.note(f"visit {t}: object {state.chronology.templates[k].identity} stays where it was ({told})")
             state, images = alternative, others
             final.pop(k, None)
             back.append(k)
