@@ -107,7 +107,7 @@ def test_what_is_light_or_ground_is_not_searched_for_known_objects_and_everythin
 ):
     rng = np.random.default_rng(1)
     patch = _box(rng, 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.004], (0.6, 0.45, 0.3))
-    new = arrivals.NewObject(Template(patch, 2, 1), np.ones(60, bool), np.zeros((0, 4, 4), bool), 0.1, 1.0, 1.0)
+    new = arrivals.NewObject(Template(patch, 2, 1), np.ones(60, bool), np.zeros((0, 4, 4), bool), 0.1, 1.0, 1.0, 0.5)
     volume = Instance(np.asarray(patch.means, np.float64), (), 3)
     light, ground, thing = (
         arrivals.Arrival(volume, _FLOOR, None, None, bared, gain)
@@ -129,7 +129,7 @@ def test_a_new_object_may_mend_what_is_around_it_but_explains_no_more_itself_tha
         rng = np.random.default_rng(1)
         patch = _box(rng, 8, [-0.1, -0.1, 0], [0.1, 0.1, 0.1], (0.6, 0.2, 0.2))
         outlines = np.zeros((1, 4, 4), bool)
-        new = arrivals.NewObject(Template(patch, 2, 1), np.ones(8, bool), outlines, 0.1, gain, own_gain)
+        new = arrivals.NewObject(Template(patch, 2, 1), np.ones(8, bool), outlines, 0.1, gain, own_gain, 0.5)
         return arrivals._explains(new, Config())
 
     assert explains(0.9, 0.9)

@@ -22,6 +22,7 @@ from ltgs_jax.template import (
     Placement,
     Search,
     Support,
+    backdrop_unlikeness,
     build_template,
     explained,
     firm_part,
@@ -52,7 +53,9 @@ _MOST = 1.3  # share of the change that an account of it may explain: beyond, it
 _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pixel of it, to be something else
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
-_SHOWN = 0.3  # share of a new object that must show: what lies in and under what was known is no object
+_SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
+_STARK = 0.7  # unlikeness in its outlines, in every photograph, that is no shade or ground: haze may hide the object
+_HAZED = 0.3  # share of such an object that must show
 _COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
 _BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
 _APART = 0.2  # share of the smaller of two outlines, up to which they may overlap and be of things side by side
@@ -79,8 +82,8 @@ class Arrival(eqx.Module):
 
 class NewObject(eqx.Module):
     """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
-    in the windows, what is left unlike the photographs, and the share of the change that it explains, and that what it
-    draws within its outlines does."""
+    in the windows, what is left unlike the photographs, the share of the change that it explains, and that what it
+    draws within its outlines does, and how unlike the photographs they were without it, in the one that tells least."""
 
     template: Template
     firm: Bool[np.ndarray, " n"]
@@ -88,6 +91,7 @@ class NewObject(eqx.Module):
     error: float
     gain: float
     own_gain: float
+    contrast: float
 
 
 Unknown = tuple[Arrival, NewObject | None, tuple[int, ...]]
@@ -137,7 +141,7 @@ def place_arrivals(
     for arrival, new, others in rest:
         after, account = _add_new(state, t, arrival, new, config, progress)
         shown = 1.0 if account is None else _shown(after, t, account.template, observations, eye=eye)
-        if shown < _SHOWN:
+        if shown < (_HAZED if new is not None and new.contrast > _STARK else _SHOWN):
             progress.note(f"visit {t}: a change left out, as a new object {shown:.2f} of it shows")
             continue
         state = after
@@ -387,7 +391,10 @@ def _as_new(
     firm, outlines = firm_part(template.splats, arrival.crop)
     # What it draws beside its outlines mends what is around it, where the scene was poorly known.
     within = np.where(np.stack([dilate(outline, 2) for outline in outlines])[..., None], images, arrival.crop.backdrop)
-    return NewObject(template, firm, outlines, error, gain, explained(within, arrival.crop)[1])
+    without, seen = backdrop_unlikeness(arrival.crop), outlines & np.asarray(arrival.crop.valid)
+    contrasts = [float(np.median(u[pixels])) for u, pixels in zip(without, seen, strict=True) if pixels.any()]
+    gains = error, gain, explained(within, arrival.crop)[1]
+    return NewObject(template, firm, outlines, *gains, min(contrasts, default=0.0))
 
 
 def _unsure(placements: dict[tuple[int, int], Placement], config: Config) -> dict[tuple[int, int], Placement]:

@@ -16,6 +16,7 @@ from .config import TemplateConfig as TemplateConfig
 from .firm import firm_part as firm_part
 from .locate import Crop as Crop
 from .locate import Refiner as Refiner
+from .locate import backdrop_unlikeness as backdrop_unlikeness
 from .locate import explained as explained
 from .locate import make_crop as make_crop
 from .locate import unlikeness as unlikeness
