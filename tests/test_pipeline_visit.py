@@ -1,6 +1,7 @@
 """What a visit's evidence is taken for: light or a thing, a burden or its foot, turned or as it stood."""
 
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -136,6 +137,28 @@ def test_a_new_object_may_mend_what_is_around_it_but_explains_no_more_itself_tha
     assert explains(1.5, 1.0)
     assert not explains(1.5, 1.5)
     assert not explains(0.3, 0.3)
+
+
+def test_haze_may_hide_what_is_plainly_something_else_and_nothing_else(state, monkeypatch):
+    rng = np.random.default_rng(1)
+    patch = _box(rng, 8, [-0.1, -0.1, 0], [0.1, 0.1, 0.01], (0.6, 0.2, 0.2))
+    account = Account(0, "added", 1.0, 0.1, 3)
+
+    def accepted(contrast: float, shown: float) -> bool:
+        outlines = np.zeros((1, 4, 4), bool)
+        new = arrivals.NewObject(Template(patch, 2, 1), np.ones(8, bool), outlines, 0.1, 1.0, 1.0, contrast)
+        monkeypatch.setattr(arrivals, "_arrivals_of", lambda *a, **k: [])
+        monkeypatch.setattr(arrivals, "_place_known", lambda s, *a, **k: (s, [], [], [(None, new, ())]))
+        monkeypatch.setattr(arrivals, "_add_new", lambda s, *a: (s, account))
+        monkeypatch.setattr(arrivals, "_shown", lambda *a, **k: shown)
+        tools = {"eye": None, "config": Config(), "rng": rng, "progress": SimpleNamespace(note=print)}
+        evidence = Evidence((), ())
+        return len(arrivals.place_arrivals(state, 1, {}, [], [], evidence, [], None, None, **tools)[1]) == 1
+
+    assert accepted(0.5, 0.7)
+    assert not accepted(0.5, 0.4)
+    assert accepted(0.8, 0.4)
+    assert not accepted(0.8, 0.2)
 
 
 def test_a_shadow_may_have_left_only_beside_where_something_stood(state):
