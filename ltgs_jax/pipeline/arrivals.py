@@ -562,8 +562,7 @@ def _settle_new(
     of the change that it explains; splats that the photographs do not support fade and are dropped."""
     size = template_diameter(template.splats)
     padded = pad_splats(template.splats, config.template.new_splats)
-    depth = jnp.where(crop.region, 0, crop.depth)  # where the photograph shows it, nothing that is known hides it
-    windows = Windows(crop.camera, crop.target, crop.backdrop, depth, crop.valid)
+    windows = Windows(crop.camera, crop.target, crop.backdrop, crop.depth, crop.valid)
     splats, _, images = fit_local(padded, windows, size=size, steps=config.template.new_steps)
     error, gain = explained(images, crop)
     splats = splats[: template.splats.count]
