@@ -54,7 +54,7 @@ _PARTLY_KNOWN = 0.3  # pixels beside a known object that changed with it, per pi
 _ROOM = 1.3  # extent of an arrival, in sizes of an object, from which on it is looked for in each part of it
 _BARED = 0.5  # share of what came, over which it lies where something that left had hidden the ground
 _SHOWN = 0.6  # share of a new object that must show: what lies in and under what was known is no object
-_STARK = 0.7  # unlikeness in its outlines, in every photograph, that is no shade or ground: haze may hide the object
+_STARK = 0.7  # unlikeness in its outlines, in most photographs, that is no shade or ground: haze may hide the object
 _HAZED = 0.3  # share of such an object that must show
 _COVERED = 0.25  # share of what changed clearly that a template must cover after the search, to be looked at closely
 _BEHIND = 0.2  # share of the change by which another may explain less than one that is sure, to be looked at closely
@@ -83,7 +83,7 @@ class Arrival(eqx.Module):
 class NewObject(eqx.Module):
     """A change as something never seen before: its splats after a short fit, those of them that are firm, its outlines
     in the windows, what is left unlike the photographs, the share of the change that it explains, and that what it
-    draws within its outlines does, and how unlike the photographs they were without it, in the one that tells least."""
+    draws within its outlines does, and how unlike the photographs they were without it, in the middle one of them."""
 
     template: Template
     firm: Bool[np.ndarray, " n"]
@@ -394,7 +394,7 @@ def _as_new(
     without, seen = backdrop_unlikeness(arrival.crop), outlines & np.asarray(arrival.crop.valid)
     contrasts = [float(np.median(u[pixels])) for u, pixels in zip(without, seen, strict=True) if pixels.any()]
     gains = error, gain, explained(within, arrival.crop)[1]
-    return NewObject(template, firm, outlines, *gains, min(contrasts, default=0.0))
+    return NewObject(template, firm, outlines, *gains, float(np.median(contrasts)) if contrasts else 0.0)
 
 
 def _unsure(placements: dict[tuple[int, int], Placement], config: Config) -> dict[tuple[int, int], Placement]:
