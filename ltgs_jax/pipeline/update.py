@@ -226,8 +226,7 @@ def _mended_scene(store: Store, key: str, run: Run, chronology: Chronology, firs
 
     def compute():
         progress.note("the mended scene tells changes better: the visits are explained again")
-        scene = composed(chronology, 0)
-        splats = scene[np.asarray(scene.logit_opacities) > -np.inf]
+        splats = drop_hidden(composed(chronology, 0))
         return _with_errors(run, splats, [v.view for v in first()], front_end, eye, progress)
 
     arrays, _ = store.run("initial", key, compute)
