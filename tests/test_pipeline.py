@@ -20,8 +20,10 @@ from ltgs_jax.fit.mend import Mended
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
 from ltgs_jax.localize import Localization
+from ltgs_jax.pipeline.cameras import Run
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
+from ltgs_jax.pipeline.views import load_views
 from ltgs_jax.render import render
 from ltgs_jax.scene import Splats, Template, compose, concatenate_splats
 
@@ -279,21 +281,20 @@ def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
     copy = tmp_path / "capture"
     shutil.copytree(capture, copy)
     photographs = sorted((copy / "images" / "IMG_0001").glob("*.png"))
-    update_stage = importlib.import_module("ltgs_jax.pipeline.update")
     whole = read_capture(copy)
     found = Localization({p.name: p.camera for p in whole.photographs}, {}, ())
-    run = update_stage.Run(whole, found, CONFIG, 0)
+    run = Run(whole, found, CONFIG, 0)
     used = run.posed(1, "update")
     damaged = next(path for path in photographs if used[0].name.endswith(path.name))
     content = bytearray(damaged.read_bytes())
     content[len(content) // 2 : len(content) // 2 + 200] = bytes(200)
     damaged.write_bytes(content)
     progress = Quiet()
-    views = update_stage.load_views(run, used, progress)
+    views = load_views(run, used, progress)
     assert [p.name for p, _ in views] == [p.name for p in used[1:]]
     assert any(used[0].name in line and line.startswith("warning") for line in progress.lines)
     with pytest.raises(InputError, match="none of the photographs"):
-        update_stage.load_views(run, used[:1], progress)
+        load_views(run, used[:1], progress)
 
 
 @pytest.mark.parametrize("strange", [1, 3])

@@ -13,13 +13,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ltgs_jax.detect import fit_tone
 from ltgs_jax.features import Classical, FrontEnd
 from ltgs_jax.fit import (
-    Budget,
     InitialConfig,
-    StreamedView,
-    View,
     VisitView,
     fit_chronology,
     fit_initial,
@@ -29,10 +25,7 @@ from ltgs_jax.fit import (
 from ltgs_jax.io import (
     Capture,
     InputError,
-    Photograph,
     arrays_of,
-    load_image,
-    load_mask,
     module_of,
     read_bytes,
     read_capture,
@@ -41,14 +34,14 @@ from ltgs_jax.io import (
 )
 from ltgs_jax.scene import Chronology, Splats, drop_hidden
 
-from .cameras import Run, hold_against_renders, locate_photographs, scaled_camera
+from .cameras import Run, hold_against_renders, locate_photographs
 from .carried import carry_on
 from .config import Config, check_config
 from .evaluate import evaluate
 from .expected import expected_errors
 from .hold import only_run
 from .ledger import make_ledger
-from .looks import Eye, Observation
+from .looks import Eye
 from .outlook import look_ahead, say_outlook
 from .outputs import never, write_outputs
 from .programs import free_programs
@@ -56,6 +49,7 @@ from .prune import drop_idle, late_splats, merge_ground
 from .state import Account, State, composed, pack_state, unpack_state
 from .store import Store, digest
 from .unknown import barely_shown, without_unexplained
+from .views import first_views, later_views, load_views, observe
 from .visit import explain_visit
 
 _UNLIKE = "it differs from the scene all over: another place, another pose, or a room in which nothing stayed"
@@ -115,21 +109,33 @@ def update(
         options = (config.io, config.render, config.fit.initial, config.detect.gamma)
         first = digest(*options, seed, files[0], *poses[0], *points, brought)
         eye = eye or Eye()
-        splats, errors = _initial_scene(store, first, run, scene, front_end, eye, progress)
+        means = _Means(store, front_end, eye, progress)
+        splats, errors = _initial_scene(means, first, run, scene)
         key = digest(key, first, *(part for each in poses for part in each))
         run = hold_against_renders(store, digest(key, "align"), run, splats, eye, progress)
-        photographs = cache(lambda: _first_views(run, progress))  # decoded once for all stages
+        photographs = cache(lambda: first_views(run, progress))  # decoded once for all stages
         key = digest(first, config.detect, config.match, config.template, config.register)
-        told = _tell(store, key, run, files, splats, errors, photographs, front_end, eye, progress)
+        told = _tell(means, key, run, files, splats, errors, photographs)
         if told.mended and config.fit.mend.again:
-            key, again = digest(told.key, options), store.again()
-            mended, errors = _mended_scene(again, key, run, told.chronology, photographs, front_end, eye, progress)
-            told = _tell(again, key, run, files, mended, errors, photographs, front_end, eye, progress)
+            key, again = digest(told.key, options), dataclasses.replace(means, store=store.again())
+            mended, errors = _mended_scene(again, key, run, told.chronology, photographs)
+            told = _tell(again, key, run, files, mended, errors, photographs)
         run, chronology, accounts = told.run, told.chronology, told.accounts
-        _ledger(store, digest(told.key, "ledger"), chronology, accounts, told.later, eye, progress)
+        _ledger(means, digest(told.key, "ledger"), chronology, accounts, told.later)
         write_outputs(out, run, chronology, splats, accounts, eye, store, progress)
         store.run("evaluate", never(), lambda: ({}, {"counts": {"rows": len(evaluate(out, capture_dir))}}))
     return chronology
+
+
+@dataclasses.dataclass(frozen=True)
+class _Means:
+    """What a stage works with: where its result is kept, what describes photographs, what renders the scene, and where
+    it says how far it is."""
+
+    store: Store
+    front_end: FrontEnd
+    eye: Eye
+    progress: Progress
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,24 +151,21 @@ class _Told:
     mended: bool
 
 
-def _tell(
-    store: Store, key: str, run: Run, files: Sequence[list], splats: Splats, errors, first, front_end, eye: Eye,
-    progress,
-) -> _Told:  # fmt: skip
+def _tell(means: _Means, key: str, run: Run, files: Sequence[list], splats: Splats, errors, first) -> _Told:
     """All visits explained in turn, against the splats of the first, then fitted together and mended."""
     config, states, accounts = run.config, [State.of_initial(splats, errors, run.capture.visits)], [[]]
     fits = [digest(key, "fit", config.fit.long)]
     for t in range(1, len(files)):
         key = digest(key, t, files[t], *run.poses(t))
         free_programs()
-        state, told, run = _one_visit(store, key, run, states[-1], t, front_end, eye, progress)
+        state, told, run = _one_visit(means, key, run, states[-1], t)
         states.append(state)
         accounts.append(told)
         fits.append(digest(key, "fit", config.fit.long))
-    later = cache(lambda: _later_views(run, states[-1].chronology, eye, progress))
-    fitted = _long_fit(store, fits, run, states, first, later, eye, progress)
+    later = cache(lambda: later_views(run, states[-1].chronology, means.eye, means.progress))
+    fitted = _long_fit(means, fits, run, states, first, later)
     key = digest(fits[-1], "mend", config.fit.mend)
-    chronology = _mend(store, key, run, fitted, first, later, eye, progress)
+    chronology = _mend(means, key, run, fitted, first, later)
     return _Told(run, chronology, accounts, key, later, chronology is not fitted)
 
 
@@ -175,77 +178,45 @@ def _files(capture: Capture, visit: int) -> list[tuple]:
     return [(p.name, p.role, stamp(p.path), stamp(p.mask_path)) for p in capture.photographs if p.visit == visit]
 
 
-def load_view(run: Run, photograph: Photograph) -> View:
-    """A photograph as the fit sees it."""
-    side = run.config.io.max_side
-    image = load_image(photograph, max_side=side)
-    return View(
-        scaled_camera(run.cameras[photograph.name], side),
-        np.rint(255 * image).astype(np.uint8),
-        load_mask(photograph, max_side=side),
-    )
-
-
-def load_views(run: Run, photographs: Sequence[Photograph], progress) -> list[tuple[Photograph, StreamedView]]:
-    """The photographs that can be decoded; one that cannot is named and left out, all of them are an error.
-
-    Each is decoded once here; the pixels of as many as `io.photograph_bytes` holds stay in memory.
-    """
-    views, budget = [], Budget(run.config.io.photograph_bytes)
-    for photograph in photographs:
-        camera = scaled_camera(run.cameras[photograph.name], run.config.io.max_side)
-        view = StreamedView(camera, partial(load_view, run, photograph), budget)
-        try:
-            view.check()
-            views.append((photograph, view))
-        except InputError as error:
-            progress.warn(f"{photograph.name}: left out, {error}")
-    if photographs and not views:
-        raise InputError(
-            f"{run.capture.folder}: none of the photographs of {photographs[0].name.split('/')[0]} is usable"
-        )
-    return views
-
-
-def _initial_scene(store: Store, key: str, run: Run, scene, front_end, eye: Eye, progress):
+def _initial_scene(means: _Means, key: str, run: Run, scene: Splats | None):
     """The first visit's splats, fitted or given, and the dissimilarity that each must be expected to leave."""
 
     def compute():
-        views = [view for _, view in load_views(run, run.posed(0, "train"), progress)]
+        views = [view for _, view in load_views(run, run.posed(0, "train"), means.progress)]
         if scene is None and not _startable(run):
             raise InputError(f"{run.capture.folder}: too few sparse points to start from; give --initial PLY")
-        splats = _fit_first(run, views, run.config.fit.initial, progress) if scene is None else scene
-        return _with_errors(run, splats, views, front_end, eye, progress)
+        splats = _fit_first(run, views, run.config.fit.initial, means.progress) if scene is None else scene
+        return _with_errors(means, run, splats, views)
 
-    arrays, _ = store.run("initial", key, compute)
+    arrays, _ = means.store.run("initial", key, compute)
     return module_of(Splats, "splats", arrays), arrays["errors"]
 
 
-def _mended_scene(store: Store, key: str, run: Run, chronology: Chronology, first, front_end, eye: Eye, progress):
+def _mended_scene(means: _Means, key: str, run: Run, chronology: Chronology, first):
     """As `_initial_scene`, the mended scene of the first visit: what it shows better now tells changes better."""
 
     def compute():
-        progress.note("the mended scene tells changes better: the visits are explained again")
+        means.progress.note("the mended scene tells changes better: the visits are explained again")
         splats = drop_hidden(composed(chronology, 0))
-        return _with_errors(run, splats, [v.view for v in first()], front_end, eye, progress)
+        return _with_errors(means, run, splats, [v.view for v in first()])
 
-    arrays, _ = store.run("initial", key, compute)
+    arrays, _ = means.store.run("initial", key, compute)
     return module_of(Splats, "splats", arrays), arrays["errors"]
 
 
-def _with_errors(run: Run, splats: Splats, views, front_end, eye: Eye, progress) -> tuple[dict, dict]:
+def _with_errors(means: _Means, run: Run, splats: Splats, views) -> tuple[dict, dict]:
     """Splats and what difference is to be expected of each, as a stage leaves them."""
     options = run.config.fit.initial
     short = dataclasses.replace(options, steps=-(-options.steps // 4), grow_every=-(-options.grow_every // 4))
-    progress.note("measuring what difference is to be expected")
+    means.progress.note("measuring what difference is to be expected")
     errors = expected_errors(
-        eye,
+        means.eye,
         splats,
         views,
-        front_end,
+        means.front_end,
         gamma=run.config.detect.gamma,
-        fit_to=partial(_fit_first, run, options=short, progress=progress) if _startable(run) else None,
-        progress=progress,
+        fit_to=partial(_fit_first, run, options=short, progress=means.progress) if _startable(run) else None,
+        progress=means.progress,
     )
     return {**arrays_of("splats", splats), "errors": errors}, {"counts": {"splats": splats.count}}
 
@@ -266,31 +237,19 @@ def _fit_first(run: Run, views, options: InitialConfig, progress) -> Splats:
     return fit_initial(start, views, key=jax.random.key(run.seed), config=options, progress=progress.step).splats
 
 
-def _observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observation]:
-    """The photographs of a visit in the light of the first."""
-    observations = []
-    for photograph, view in load_views(run, run.posed(t, "update"), progress):
-        image = view.image.astype(np.float32) / 255
-        tone = fit_tone(image, eye.image(state.chronology.background, view.camera), view.mask)
-        if tone.changed:
-            progress.note(f"{photograph.name}: other light, taken out")
-        observations.append(Observation(photograph.name, view.camera, tone(image), view.mask))
-    return observations
-
-
-def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end, eye: Eye, progress):
+def _one_visit(means: _Means, key: str, run: Run, state: State, t: int):
     """Explain one visit; its state on disk. The run goes on without the photographs that differ all over."""
-    config = run.config
+    config, eye, progress = run.config, means.eye, means.progress
 
     def compute():
-        observations = _observe(run, state, t, eye, progress)
+        observations = observe(run, state, t, eye, progress)
         rng = np.random.default_rng([run.seed, t])
         explained = explain_visit(
             state,
             t,
             observations,
-            front_end,
-            earlier=cache(lambda visit: _observe(run, state, visit, eye, progress)),  # decoded once for all objects
+            means.front_end,
+            earlier=cache(lambda visit: observe(run, state, visit, eye, progress)),  # decoded once for all objects
             eye=eye,
             config=config,
             rng=rng,
@@ -311,7 +270,7 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
         told = [a.to_json() for a in accounts]
         return arrays, {**notes, "accounts": told, "unlike": explained.unlike, "counts": counts}
 
-    arrays, notes = store.run(f"visit_{t:03d}", key, compute)
+    arrays, notes = means.store.run(f"visit_{t:03d}", key, compute)
     for name in notes["unlike"]:
         progress.warn(f"{name}: left out, {_UNLIKE}")
     accounts = [Account.from_json(a) for a in notes["accounts"]]
@@ -321,12 +280,10 @@ def _one_visit(store: Store, key: str, run: Run, state: State, t: int, front_end
     return unpack_state(arrays, notes, run.capture.visits), accounts, run
 
 
-def _long_fit(
-    store: Store, keys: Sequence[str], run: Run, states: Sequence[State], first, later, eye: Eye, progress
-) -> Chronology:
+def _long_fit(means: _Means, keys: Sequence[str], run: Run, states: Sequence[State], first, later) -> Chronology:
     """The chronology with everything fitted together; skipped, and said so, when nothing changed. From what a fit left
     on disk of fewer visits (by the keys of each number of them) it goes on: the visits since then alone are new."""
-    config, state = run.config, states[-1]
+    config, state, progress = run.config, states[-1], means.progress
 
     def compute():
         if not state.chronology.templates:
@@ -336,7 +293,7 @@ def _long_fit(
         lean = merge_ground(state)
         merged = state.chronology.background.count - lean.chronology.background.count
         late = late_splats(lean, states[0].chronology.background)
-        since, earlier = _earlier_fit(store, keys, run, states)
+        since, earlier = _earlier_fit(means.store, keys, run, states)
         gone = np.zeros(len(late), bool)
         if earlier is not None:
             lean, gone = carry_on(lean, *earlier)
@@ -355,20 +312,20 @@ def _long_fit(
             fitted = eqx.tree_at(
                 lambda s: s.chronology, lean, jax.tree.map(np.asarray, chronology), is_leaf=lambda x: x is None
             )
-            fitted, idle = drop_idle(fitted, late[~gone], later(), eye)
+            fitted, idle = drop_idle(fitted, late[~gone], later(), means.eye)
         arrays, notes = pack_state(fitted)
         counts = {"steps": len(losses), "splats_merged": merged, "splats_dropped": int(idle.sum())}
         gone[np.flatnonzero(~gone)[idle]] = True
         return {**arrays, "gone": gone}, {**notes, "counts": counts}
 
-    arrays, notes = store.run("fit", keys[-1], compute)
+    arrays, notes = means.store.run("fit", keys[-1], compute)
     return unpack_state(arrays, notes, run.capture.visits).chronology
 
 
-def _mend(store: Store, key: str, run: Run, chronology: Chronology, first, later, eye: Eye, progress) -> Chronology:
+def _mend(means: _Means, key: str, run: Run, chronology: Chronology, first, later) -> Chronology:
     """The chronology with its background fitted on, where photographs of later visits show much that those of the first
     hardly did; skipped, and said so, where they do not."""
-    config = run.config.fit.mend
+    config, eye, progress = run.config.fit.mend, means.eye, means.progress
 
     def compute():
         if config.passes == 0 or not chronology.templates or not first() or not later():
@@ -398,7 +355,7 @@ def _mend(store: Store, key: str, run: Run, chronology: Chronology, first, later
         arrays = arrays_of("background", jax.tree.map(np.asarray, found.chronology.background)) if found.kept else {}
         return arrays, {"mended": found.kept, "errors": errors, "counts": counts}
 
-    arrays, notes = store.run("mend", key, compute)
+    arrays, notes = means.store.run("mend", key, compute)
     if not notes["mended"]:
         return chronology
     return eqx.tree_at(lambda c: c.background, chronology, module_of(Splats, "background", arrays))
@@ -415,32 +372,15 @@ def _earlier_fit(store: Store, keys: Sequence[str], run: Run, states: Sequence[S
     return 1, None
 
 
-def _first_views(run: Run, progress) -> list[VisitView]:
-    """The photographs of the first visit that it was fitted to."""
-    return [VisitView(view, 0) for _, view in load_views(run, run.posed(0, "train"), progress)]
-
-
-def _later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[VisitView]:
-    """The photographs of later visits that may be used, in the light of the first."""
-    views = []
-    for t in range(1, len(run.capture.visits)):
-        loaded = load_views(run, run.posed(t, "update"), progress)
-        scene = drop_hidden(composed(chronology, t)) if loaded else None
-        for _, view in loaded:
-            image = view.image.astype(np.float32) / 255
-            tone = fit_tone(image, eye.image(scene, view.camera), view.mask)
-            views.append(VisitView(View(view.camera, np.rint(255 * tone(image)).astype(np.uint8), view.mask), t))
-    return views
-
-
-def _ledger(store: Store, key: str, chronology: Chronology, accounts, later, eye: Eye, progress) -> None:
+def _ledger(means: _Means, key: str, chronology: Chronology, accounts, later) -> None:
     """What each visit added and what that bought, in stages.json."""
 
     def compute():
         views = later() if chronology.templates else []
-        return {}, {"counts": {"ledger": make_ledger(chronology, accounts, views, eye, progress=progress.step)}}
+        ledger = make_ledger(chronology, accounts, views, means.eye, progress=means.progress.step)
+        return {}, {"counts": {"ledger": ledger}}
 
-    store.run("ledger", key, compute)
+    means.store.run("ledger", key, compute)
 
 
 def _environment() -> dict:

@@ -149,15 +149,15 @@ def _put_back(
         left, stayed, shown = unlike_where_different(images, others, observations)
         # What hardly shows either way, under something that came, gives no account of itself.
         hidden = shown < _LEAST_SHOWN * config.template.min_pixels
-        return hidden or stayed <= left * (1 + config.template.still_margin), left, stayed, others
+        return stayed <= left * (1 + config.template.still_margin), hidden, left, stayed, others
 
     back = []
     for k in gone:
         alternative = set_from(state, t, k, visible=True, pose=state.chronology.world_from_template[t - 1, k])
-        stays, left, stayed, others = judged(alternative)
-        if stays:
+        as_good, hidden, left, stayed, others = judged(alternative)
+        if as_good or hidden:
             told = f"unlikeness {stayed:.3f} there, {left:.3f} without"
-            told += ", too little shows of it to tell" * (stayed > left * (1 + config.template.still_margin))
+            told += "" if as_good else ", too little shows of it to tell"
             progress.note(f"visit {t}: object {state.chronology.templates[k].identity} stays where it was ({told})")
             state, images = alternative, others
             final.pop(k, None)
@@ -166,8 +166,8 @@ def _put_back(
             final[k] = Account(k, "removed", 1 - left / max(stayed, 1e-9), left, len(observations))
     for remnant in remnants:
         alternative = extend_background(state, remnant.splats, remnant.errors, np.zeros(len(remnant.errors), bool), 0)
-        stays, left, stayed, others = judged(alternative)
-        if stays:
+        as_good, hidden, left, stayed, others = judged(alternative)
+        if as_good or hidden:
             state, images = alternative, others
         elif remnant.whole not in back:
             state = extend_template(state, remnant.whole, remnant.splats, remnant.errors)
