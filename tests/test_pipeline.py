@@ -19,8 +19,9 @@ from ltgs_jax.demo import make_capture
 from ltgs_jax.fit.mend import Mended
 from ltgs_jax.geometry import SE3, Camera
 from ltgs_jax.io import InputError, load_chronology, read_capture, read_json, read_ply, read_tracks
-from ltgs_jax.localize import Localization
-from ltgs_jax.pipeline.cameras import Run
+from ltgs_jax.localize import Localization, PhotographStatus
+from ltgs_jax.pipeline import cameras
+from ltgs_jax.pipeline.cameras import Run, hold_against_renders
 from ltgs_jax.pipeline.outputs import read_cameras
 from ltgs_jax.pipeline.store import Store, digest
 from ltgs_jax.pipeline.views import load_views
@@ -295,6 +296,23 @@ def test_a_damaged_photograph_is_named_and_the_rest_goes_on(capture, tmp_path):
     assert any(used[0].name in line and line.startswith("warning") for line in progress.lines)
     with pytest.raises(InputError, match="none of the photographs"):
         load_views(run, used[:1], progress)
+
+
+def test_whose_pose_was_found_on_renders_is_remembered(capture, tmp_path, monkeypatch):
+    whole = read_capture(capture)
+    placed = {p.name: p.camera for p in whole.photographs}
+    rough, lost, *_ = [p.name for p in whole.at(1, "update")]
+    off = SE3(placed[rough].cam_from_world.quat, placed[rough].cam_from_world.xyz + 0.02)
+    before = {**placed, rough: replace(placed[rough], cam_from_world=off)}
+    del before[lost]
+    run = Run(whole, Localization(before, {}, ()), CONFIG, 0)
+    status = tuple(PhotographStatus(name, "localized", 9, None, None) for name in (rough, lost))
+    monkeypatch.setattr(cameras, "align_later", lambda *_, **__: Localization(placed, {}, status))
+    for _ in ("computed", "taken from disk"):
+        progress = Quiet()
+        held = hold_against_renders(Store(tmp_path, progress), "key", run, None, None, progress)
+        assert held.on_renders == {rough, lost}
+        assert [rough in line or lost in line for line in progress.lines if line.startswith("warning")] == [True, True]
 
 
 @pytest.mark.parametrize("strange", [1, 3])

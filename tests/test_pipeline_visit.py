@@ -266,7 +266,7 @@ def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_
     assert [m.identity for m in after.chronology.templates] == ([1, 1] if joined else [1, 2])
     assert [a.kind for a in told] == (["new_state"] if joined else ["removed", "added"])
     every = [[], [Account(0, "moved", 0.5, 0.1, 3)], told, []]
-    track = _track(after.chronology, 1, every)
+    track = _track(after.chronology, 1, every, [0.0] * 4)
     assert [s["event"] for s in track["states"]] == [
         "moved",
         "new_state" if joined else "removed",
@@ -276,9 +276,12 @@ def test_what_comes_in_the_place_of_what_left_with_its_colours_is_that_in_a_new_
     assert _name_of(after.chronology, 1) == ("object_0001_0002.ply" if joined else "object_0002.ply")
     if joined:
         assert track["states"][1]["confidence"] == pytest.approx(0.8)
+        on_renders = _track(after.chronology, 1, every, [0.0, 0.0, 1.0, 0.0])["states"]
+        assert on_renders[1]["confidence"] == pytest.approx(0.8 * (1 - 0.5**1.5) / (1 - 0.5**3), abs=1e-3)
+        assert on_renders[0]["confidence"] == track["states"][0]["confidence"]
         # Closed again: the first template is there, and the object changed its state once more.
         again = set_from(set_from(after, 3, 1, visible=False), 3, 0, visible=True, pose=_shifted(0.6))
-        assert _track(again.chronology, 1, every)["states"][2]["event"] == "new_state"
+        assert _track(again.chronology, 1, every, [0.0] * 4)["states"][2]["event"] == "new_state"
 
 
 def test_what_has_the_place_colours_and_shape_of_what_left_and_fits_none_of_its_poses_is_another_thing(state):
@@ -319,7 +322,7 @@ def test_what_shows_another_side_elsewhere_is_known_by_colours_and_shape(state, 
     ):
         np.testing.assert_allclose(a, b, atol=1e-6)
     if known:
-        track = _track(joined.chronology, 1, [[], [], told, []])["states"]
+        track = _track(joined.chronology, 1, [[], [], told, []], [0.0] * 4)["states"]
         assert [s["event"] for s in track] == (
             ["moved", "moved", "still"] if left == 2 else ["removed", "added", "still"]
         )

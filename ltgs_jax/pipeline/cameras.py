@@ -18,12 +18,13 @@ from .store import Store
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """What every stage needs."""
+    """What every stage needs; `on_renders` names the photographs whose pose was found on renders of the first scene."""
 
     capture: Capture
     found: Localization
     config: Config
     seed: int
+    on_renders: frozenset[str] = frozenset()
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -81,16 +82,18 @@ def hold_against_renders(store: Store, key: str, run: Run, initial: Splats, eye:
         options = {"max_side": run.config.io.max_side, "config": run.config.localize, "progress": _steps_of(progress)}
         return _packed(align_later(run.capture, run.found, view, **options))
 
-    found = _unpacked(*store.run("align", key, compute))
+    found, on_renders = _unpacked(*store.run("align", key, compute)), set()
     for photograph in found.photographs:
         name, agree = photograph.name, f"{photograph.inliers} patches agree"
         if photograph.status == "rejected":
             progress.warn(f"{name}: left out, {photograph.reason}")
         elif name not in run.cameras:
+            on_renders.add(name)
             progress.warn(f"{name}: placed by renders of the first visit after all, {agree}")
         elif name in found.cameras and not _same_pose(run.cameras[name], found.cameras[name]):
+            on_renders.add(name)
             progress.warn(f"{name}: its pose was rough, mended on renders of the first visit, {agree}")
-    return Run(found.apply(run.capture), found, run.config, run.seed)
+    return Run(found.apply(run.capture), found, run.config, run.seed, frozenset(on_renders))
 
 
 def _same_pose(a: Camera, b: Camera) -> bool:

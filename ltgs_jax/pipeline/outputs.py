@@ -86,7 +86,8 @@ def write_outputs(
             manifest.append(entry)
         write_json(out / "report.json", {"photographs": manifest})
         identities = dict.fromkeys(m.identity for m in chronology.templates)
-        objects = [_track(chronology, identity, accounts) for identity in identities]
+        on_renders = [_share_on_renders(run, t) for t in range(len(chronology.visits))]
+        objects = [_track(chronology, identity, accounts, on_renders) for identity in identities]
         write_tracks(
             out / "tracks.json",
             visits=list(chronology.visits),
@@ -166,8 +167,19 @@ def pose_change(a: SE3, b: SE3, size: float) -> tuple[float, float]:
     return moved, float(rotation_angle(motion.quat / jnp.linalg.norm(motion.quat)))
 
 
-def _track(chronology: Chronology, identity: int, accounts: Sequence[Sequence[Account]]) -> dict:
-    """The entry of one object in tracks.json: of each visit the template that shows, or showed last, and its pose."""
+def _share_on_renders(run, visit: int) -> float:
+    """Of a visit's photographs that are used, the share whose pose was found on renders of the first scene."""
+    used = [p.name for p in run.posed(visit, "update")]
+    return sum(name in run.on_renders for name in used) / max(len(used), 1)
+
+
+def _track(
+    chronology: Chronology, identity: int, accounts: Sequence[Sequence[Account]], on_renders: Sequence[float]
+) -> dict:
+    """The entry of one object in tracks.json: of each visit the template that shows, or showed last, and its pose.
+
+    `on_renders`: of each visit, the share of its photographs whose pose was found on renders.
+    """
     states_of = [k for k, m in enumerate(chronology.templates) if m.identity == identity]
     visible = np.asarray(chronology.visible)
     boxes = {k: _box_of(chronology.templates[k].splats) for k in states_of}
@@ -204,7 +216,7 @@ def _track(chronology: Chronology, identity: int, accounts: Sequence[Sequence[Ac
                     "wxyz": (quat / np.linalg.norm(quat)).tolist(),
                     "xyz": np.asarray(pose.xyz, float).tolist(),
                 },
-                "confidence": 1.0 if account is None else round(_confidence(account), 3),
+                "confidence": 1.0 if account is None else round(_confidence(account, on_renders[t]), 3),
                 "inliers": 0 if account is None else account.views,
                 "residual": 0.0 if account is None else account.residual,
                 "ambiguous_axis": None if axis is None else [*axis],
@@ -240,6 +252,8 @@ def _name_of(chronology: Chronology, k: int) -> str:
     return f"object_{template.identity:04d}{f'_{template.source_visit:04d}' if later else ''}.ply"
 
 
-def _confidence(account: Account) -> float:
-    """Between 0 and 1: more photographs and a larger share of the error explained."""
-    return float(np.clip(account.gain, 0, 1) * (1 - 0.5 ** min(account.views, 3)) / (1 - 0.5**3))
+def _confidence(account: Account, on_renders: float) -> float:
+    """Between 0 and 1: more photographs and a larger share of the error explained. A photograph whose pose was found on
+    renders of the scene is no witness apart from the scene, and counts half."""
+    witnesses = min(account.views, 3) * (1 - 0.5 * on_renders)
+    return float(np.clip(account.gain, 0, 1) * (1 - 0.5**witnesses) / (1 - 0.5**3))
