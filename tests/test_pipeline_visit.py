@@ -21,7 +21,7 @@ from ltgs_jax.pipeline.departures import _went_along
 from ltgs_jax.pipeline.ground import ground_shade, light_alone
 from ltgs_jax.pipeline.in_place import _turned_candidates
 from ltgs_jax.pipeline.ledger import small_views
-from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host
+from ltgs_jax.pipeline.looks import Evidence, Eye, Observation, on_host, still_changed
 from ltgs_jax.pipeline.outputs import _name_of, _track
 from ltgs_jax.pipeline.prune import drop_idle, late_splats, merge_ground, without
 from ltgs_jax.pipeline.reshaped import join_states
@@ -201,6 +201,47 @@ def test_what_looks_a_little_otherwise_all_over_is_looked_at_turned(state):
     assert candidates(1.8, 0.9) == [0]
     assert candidates(0.9, 0.4) == []
     assert candidates(3.0) == []  # one photograph may be wrong all over
+
+
+def test_what_a_template_leaves_changed_where_it_is_put_is_counted_there_alone(state):
+    eye, K = Eye(), jnp.asarray([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    down = SE3(jnp.asarray([0.0, 1, 0, 0]), jnp.asarray([-0.3, 0.0, 2.5]))
+    photograph = Observation("c/0.png", Camera(down, K, 64, 48), np.zeros((48, 64, 3)), np.ones((48, 64), bool))
+    scene = scene_at(state, 2)
+    cover = eye.cover(scene, [0], [photograph])[0]
+
+    def evidence(mask) -> Evidence:
+        return Evidence((), (ChangeMap(np.zeros((48, 64), np.float32), np.zeros((48, 64)), mask, False),))
+
+    def left(before, after) -> float:
+        return still_changed(scene, 0, [photograph], evidence(before), evidence(after), eye=eye)
+
+    half = cover & (np.cumsum(cover).reshape(cover.shape) <= cover.sum() / 2)
+    assert left(cover, ~cover) == 0  # what changed elsewhere is not its affair
+    assert left(cover, half) == pytest.approx(0.5, abs=0.02)
+    assert left(half, cover) > 1.9
+    assert left(~cover, cover) == cover.sum()  # nothing had changed there
+
+
+@pytest.mark.parametrize(("worth", "remains", "known"), [(0.1, 0.2, True), (0.1, 2.0, False), (0.6, 2.0, True)])
+def test_a_known_object_that_leaves_the_change_where_it_is_put_is_not_what_came(
+    state, monkeypatch, worth, remains, known
+):
+    outlines = np.zeros((1, 4, 4), bool)
+    found = Placement(_shifted(0.1), 0.1, worth, 0.9, 1.0, 1.0, outlines, None)
+    box = _box(np.random.default_rng(1), 60, [-0.1, -0.1, 0], [0.1, 0.1, 0.1])
+    new = arrivals.NewObject(Template(box, 2, 1), np.ones(60, bool), outlines, 0.1, worth, worth, 0.5)
+    monkeypatch.setattr(arrivals, "_as_new", lambda *a, **k: new)
+    monkeypatch.setattr(arrivals, "_placements", lambda *a, **k: {(0, 0): found})
+    monkeypatch.setattr(arrivals, "_shape_beside", lambda *a: 1.0)
+    monkeypatch.setattr(arrivals, "compare", lambda *a: None)
+    monkeypatch.setattr(arrivals, "still_changed", lambda *a, **k: remains)
+    came = arrivals.Arrival(Instance(np.asarray(box.means, np.float64), (), 1), _FLOOR, None, None, 0.0, None)
+    hidden, lines = set_from(state, 1, 0, visible=False), []
+    tools = {"eye": None, "config": Config(), "rng": None, "progress": SimpleNamespace(note=lines.append)}
+    after, accounts, _, rest = arrivals._place_known(hidden, 1, {}, [came], [], None, None, **tools)
+    assert bool(after.chronology.visible[1, 0]) == known == bool(accounts) == (not rest)
+    assert any("2.00 of the change is still seen" in line for line in lines) == (not known)
 
 
 def test_what_several_groups_cover_is_told_at_once_as_each_by_itself(state):

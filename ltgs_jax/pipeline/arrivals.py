@@ -35,7 +35,7 @@ from ltgs_jax.template import (
 
 from .config import Config
 from .ground import ground_shade, light_alone
-from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, vantage_of
+from .looks import Evidence, Eye, Observation, compare, cone_of, on_host, still_changed, vantage_of
 from .matched import SIDE, Matcher
 from .state import (
     Account,
@@ -204,6 +204,14 @@ def _place_known(
     looked_at, identities = dict(placements), [m.identity for m in state.chronology.templates]
     unlike: dict[int, set[int]] = {i: set() for i in range(len(arrivals))}
     for (i, k), found in _unsure(looked_at, config).items():
+        trial = scene_at(set_from(state, t, k, visible=True, pose=found.world_from_template), t)
+        with_it = compare(eye, trial, observations, front_end, config)
+        remains = still_changed(trial, k, observations, evidence, with_it, eye=eye)
+        if remains > config.template.tau_remains:
+            what = f"with it there, {remains:.2f} of the change is still seen"
+            progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: {what}")
+            del placements[i, k]
+            continue
         new, others = as_new(i), [other for (j, m), other in looked_at.items() if j == i and m != k]
         if new is None:
             continue

@@ -15,7 +15,7 @@ from ltgs_jax.template import middle_of, nudged, place_template, search_template
 
 from .arrivals import convincing, crop_around
 from .config import Config
-from .looks import Evidence, Eye, Observation, compare, unlike_where_different
+from .looks import Evidence, Eye, Observation, compare, still_changed, unlike_where_different
 from .matched import SIDE, Matcher
 from .state import Account, State, came_to_place, scene_at, set_from
 
@@ -97,7 +97,7 @@ def turn_in_place(
             continue
         trial = set_from(hidden, t, k, visible=True, pose=pose, unsure=config.detect.moved)
         with_it = compare(eye, scene_at(trial, t), observations, front_end, config)
-        if _still_changed(trial, t, k, observations, without, with_it, eye=eye, config=config):
+        if still_changed(scene_at(trial, t), k, observations, without, with_it, eye=eye) > config.template.tau_remains:
             continue
         after = with_it
         since = came_to_place(state, t - 1, k)
@@ -151,16 +151,3 @@ def _elsewhere(after: SE3, before: SE3, template: Template, size: float) -> bool
     turn = float(rotation_angle((before.inverse() @ after).quat))
     shift = np.linalg.norm(np.asarray(after.apply(middle[None]) - before.apply(middle[None])))
     return bool(turn > _TURNED or shift > _SHIFTED * size)
-
-
-def _still_changed(
-    state: State, t: int, k: int, observations, before: Evidence, after: Evidence, *, eye: Eye, config: Config
-) -> bool:
-    """Whether a template where it is does not make the change go away: the evidence without it and with it.
-
-    The test is detection's own: what the template shows there, against what its splats are expected to leave.
-    """
-    cover = eye.cover(scene_at(state, t), [k], observations)
-    was = sum((c & m).sum() for c, m in zip(cover, before.masks, strict=True))
-    now = sum((c & m).sum() for c, m in zip(cover, after.masks, strict=True))
-    return bool(now > config.template.tau_remains * max(was, 1))

@@ -169,6 +169,22 @@ def compare(
     return Evidence(tuple(looks), tuple(changes))
 
 
+def still_changed(
+    scene: tuple, template: int, observations: Sequence[Observation], before: Evidence, after: Evidence, *, eye: Eye
+) -> float:
+    """Of the change where a scene (`scene_at`) shows a template, the share that is still seen with it there: from the
+    evidence without it and with it. Above 1 where it changes more than it explains.
+
+    The test is detection's own: what the template shows there, against what its splats are expected to leave.
+    """
+    cover = eye.cover(scene, [template], observations)
+
+    def seen(evidence: Evidence) -> int:
+        return sum(int((c & mask).sum()) for c, mask in zip(cover, evidence.masks, strict=True))
+
+    return seen(after) / max(seen(before), 1)
+
+
 def unlike_where_different(
     images: Sequence[Float[np.ndarray, "h w 3"]], others: Sequence[Float[np.ndarray, "h w 3"]], observations
 ) -> tuple[float, float, float]:
