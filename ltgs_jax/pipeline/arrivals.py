@@ -204,25 +204,24 @@ def _place_known(
     looked_at, identities = dict(placements), [m.identity for m in state.chronology.templates]
     unlike: dict[int, set[int]] = {i: set() for i in range(len(arrivals))}
     for (i, k), found in _unsure(looked_at, config).items():
-        trial = scene_at(set_from(state, t, k, visible=True, pose=found.world_from_template), t)
-        with_it = compare(eye, trial, observations, front_end, config)
-        remains = still_changed(trial, k, observations, evidence, with_it, eye=eye)
-        if remains > config.template.tau_remains:
-            what = f"with it there, {remains:.2f} of the change is still seen"
-            progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: {what}")
-            del placements[i, k]
-            continue
-        new, others = as_new(i), [other for (j, m), other in looked_at.items() if j == i and m != k]
-        if new is None:
-            continue
-        shape = _shape_beside(found, others, new, arrivals[i].crop, config)
-        share = found.gain / min(max(new.gain, 1e-3), 1)
-        if shape < config.template.tau_shape or share < config.template.tau_share:
-            what = f"outlines overlap by {shape:.2f}, and it explains {share:.2f} of what a new object would"
-            progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: their {what}")
-            del placements[i, k]
+        new, why = as_new(i), ""
+        if new is not None:
+            others = [other for (j, m), other in looked_at.items() if j == i and m != k]
+            shape = _shape_beside(found, others, new, arrivals[i].crop, config)
+            share = found.gain / min(max(new.gain, 1e-3), 1)
+            if shape < config.template.tau_shape or share < config.template.tau_share:
+                why = f"their outlines overlap by {shape:.2f}, and it explains {share:.2f} of what a new object would"
             if shape < config.template.tau_shape:
                 unlike[i].add(identities[k])
+        if not why:
+            trial = scene_at(set_from(state, t, k, visible=True, pose=found.world_from_template), t)
+            with_it = compare(eye, trial, observations, front_end, config)
+            remains = still_changed(trial, k, observations, evidence, with_it, eye=eye)
+            if remains > config.template.tau_remains:
+                why = f"with it there, {remains:.2f} of the change is still seen"
+        if why:
+            progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: {why}")
+            del placements[i, k]
     accounts, known, rest = [], [], []
     for i, k in _assigned(len(arrivals), placements, identities, config):
         if k is None:
