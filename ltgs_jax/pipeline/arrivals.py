@@ -217,8 +217,8 @@ def _place_known(
             trial = scene_at(set_from(state, t, k, visible=True, pose=found.world_from_template), t)
             with_it = compare(eye, trial, observations, front_end, config)
             remains = still_changed(trial, k, observations, evidence, with_it, eye=eye)
-            if remains > config.template.tau_remains:
-                why = f"with it there, {remains:.2f} of the change is still seen"
+            if remains > 1:
+                why = f"with it there, {remains:.2f} times as many pixels are changed as without it"
         if why:
             progress.note(f"visit {t}: arrival {i} is not object {identities[k]}: {why}")
             del placements[i, k]
