@@ -96,8 +96,9 @@ def turn_in_place(
         if not _elsewhere(pose, before, template, size):
             continue
         trial = set_from(hidden, t, k, visible=True, pose=pose, unsure=config.detect.moved)
-        with_it = compare(eye, scene_at(trial, t), observations, front_end, config)
-        if still_changed(scene_at(trial, t), k, observations, without, with_it, eye=eye) > config.template.tau_remains:
+        turned_scene = scene_at(trial, t)
+        with_it = compare(eye, turned_scene, observations, front_end, config)
+        if still_changed(turned_scene, k, observations, without, with_it, eye=eye) > config.template.tau_remains:
             continue
         after = with_it
         since = came_to_place(state, t - 1, k)

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+from jaxtyping import Float
 
 from ltgs_jax.detect import fit_tone
 from ltgs_jax.fit import Budget, StreamedView, View, VisitView
 from ltgs_jax.io import InputError, Photograph, load_image, load_mask
-from ltgs_jax.scene import Chronology, drop_hidden
+from ltgs_jax.scene import Chronology, Splats, drop_hidden
 
 from .cameras import Run, scaled_camera
 from .looks import Eye, Observation
@@ -59,9 +60,8 @@ def later_views(run: Run, chronology: Chronology, eye: Eye, progress) -> list[Vi
         loaded = load_views(run, run.posed(t, "update"), progress)
         scene = drop_hidden(composed(chronology, t)) if loaded else None
         for _, view in loaded:
-            image = view.image.astype(np.float32) / 255
-            tone = fit_tone(image, eye.image(scene, view.camera), view.mask)
-            views.append(VisitView(View(view.camera, np.rint(255 * tone(image)).astype(np.uint8), view.mask), t))
+            image, _ = _in_first_light(view, scene, eye)
+            views.append(VisitView(View(view.camera, np.rint(255 * image).astype(np.uint8), view.mask), t))
     return views
 
 
@@ -69,9 +69,15 @@ def observe(run: Run, state: State, t: int, eye: Eye, progress) -> list[Observat
     """The photographs of a visit in the light of the first."""
     observations = []
     for photograph, view in load_views(run, run.posed(t, "update"), progress):
-        image = view.image.astype(np.float32) / 255
-        tone = fit_tone(image, eye.image(state.chronology.background, view.camera), view.mask)
-        if tone.changed:
+        image, changed = _in_first_light(view, state.chronology.background, eye)
+        if changed:
             progress.note(f"{photograph.name}: other light, taken out")
-        observations.append(Observation(photograph.name, view.camera, tone(image), view.mask))
+        observations.append(Observation(photograph.name, view.camera, image, view.mask))
     return observations
+
+
+def _in_first_light(view: StreamedView, scene: Splats, eye: Eye) -> tuple[Float[np.ndarray, "h w 3"], bool]:
+    """A photograph in the light of a scene of the first visit's, in 0…1, and whether its own was another."""
+    image = view.image.astype(np.float32) / 255
+    tone = fit_tone(image, eye.image(scene, view.camera), view.mask)
+    return tone(image), tone.changed
